@@ -54,7 +54,7 @@ class Division:
         return np.asarray(centre_px + offset * (1.0 + self.kappa * r2))
 
     def distort(self, q_px: Array, focal_px: Array, centre_px: Array) -> Array:
-        """Observed image points: the root of ``r_u = r_d (1 + kappa r_d^2)`` next to r_u, by Newton.
+        """Observed image points: the root of ``r_u = r_d (1 + kappa r_d^2)`` by Newton from r_u.
 
         NaN where there is none (kappa < 0 and r_u beyond the fold of the model).
         """
@@ -200,7 +200,9 @@ class Device:
         A direction has unit component along the optical axis, so ``position_m + t * ray`` lies at
         depth t metres in front of the device.
         """
-        ideal = self.lens.undistort(np.asarray(q_px, dtype=np.float64), self.focal_px, self.centre_px)
+        ideal = self.lens.undistort(
+            np.asarray(q_px, dtype=np.float64), self.focal_px, self.centre_px
+        )
         slope = (ideal - self.centre_px) / self.focal_px
         local = np.concatenate([slope, np.ones_like(slope[..., :1])], axis=-1)
         return np.asarray(local @ self.rotation)
