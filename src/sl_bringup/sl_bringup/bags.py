@@ -1,0 +1,356 @@
+"""Recordings, without ROS: which topics matter, their types, and reading them robustly.
+
+rosbag2 directories, bare ``.mcap`` and ``.db3`` files are read, with or without
+``metadata.yaml``. A damaged bag gives what is readable, and says what is lost.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from rosbags.interfaces import Connection, ConnectionExtRosbag2
+from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2.storage_mcap import McapReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from sl_bringup.mended_mcap import MendedPath
+from sl_projector.errors import BagError
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic of the node graph that an evaluation needs.
+
+    Parameters
+    ----------
+    name : str
+        Below the rig's namespace.
+    msgtype : str
+        Its type.
+    latched : bool
+        Published once for all who come later (transient local).
+    """
+
+    name: str
+    msgtype: str
+    latched: bool = False
+
+
+TRIGGER = Topic("projector/trigger", "sl_interfaces/msg/PatternTrigger")
+IMAGE = Topic("camera/image_raw", "sensor_msgs/msg/Image")
+POSE = Topic("stage/pose", "geometry_msgs/msg/PoseStamped")
+CALIBRATION = Topic("calibration/rig", "sl_interfaces/msg/RigCalibration", latched=True)
+TOPICS = (TRIGGER, IMAGE, POSE, CALIBRATION)
+
+DEFAULT_NAMESPACE = "/sl"
+
+
+def interface_dir() -> Path:
+    """Directory of the ``.msg`` files of ``sl_interfaces``.
+
+    The source tree that this file lies in comes first, because those definitions fit this code;
+    then what is installed (ament prefixes, then this Python's prefix).
+
+    Raises
+    ------
+    BagError
+        When there is none.
+    """
+    prefixes = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
+    places = [
+        Path(__file__).resolve().parents[2] / "sl_interfaces" / "msg",
+        *(Path(p) / "share" / "sl_interfaces" / "msg" for p in [*prefixes, sys.prefix]),
+    ]
+    for place in places:
+        if (place / "PatternTrigger.msg").is_file():
+            return place
+    raise BagError(
+        f"no message definitions of sl_interfaces in {', '.join(map(str, places))}; "
+        "expected it to be installed"
+    )
+
+
+@functools.cache
+def typestore() -> Typestore:
+    """ROS 2 Jazzy's types and those of ``sl_interfaces``."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types: dict[str, Any] = {}
+    for path in sorted(interface_dir().glob("*.msg")):
+        types.update(get_types_from_msg(path.read_text(), f"sl_interfaces/msg/{path.stem}"))
+    store.register(types)
+    return store
+
+
+def message_class(msgtype: str) -> Any:
+    """Class of a message type, to be filled with keyword arguments."""
+    return typestore().types[msgtype]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One message of a bag.
+
+    Parameters
+    ----------
+    topic : Topic
+        Which of `TOPICS` it is.
+    received_ns : int
+        When it was recorded, nanoseconds since the epoch.
+    message : object
+        With the fields of its ``.msg`` file; arrays are numpy views.
+    """
+
+    topic: Topic
+    received_ns: int
+    message: Any
+
+
+class _Storage(Protocol):
+    @property
+    def connections(self) -> list[Connection]: ...
+
+    def messages(
+        self, connections: Sequence[Connection]
+    ) -> Iterator[tuple[Connection, int, bytes]]: ...
+
+
+@dataclass
+class Bag:
+    """An open recording.
+
+    Parameters
+    ----------
+    path : Path
+        Where it is.
+    namespace : str
+        Namespace of the rig in it.
+    lost : list of str
+        What could not be read, in words; grows while messages are read.
+    """
+
+    path: Path
+    namespace: str
+    lost: list[str] = field(default_factory=list)
+    _storages: list[tuple[str, _Storage]] = field(default_factory=list)
+
+    def messages(self, *topics: Topic) -> Iterator[Recorded]:
+        """Yield the messages of the given topics (default: all of `TOPICS`) as recorded.
+
+        Raises
+        ------
+        BagError
+            When a message does not fit its definition.
+        """
+        wanted = {f"{self.namespace}/{topic.name}": topic for topic in topics or TOPICS}
+        for name, storage in self._storages:
+            connections = [c for c in storage.connections if c.topic in wanted]
+            if connections:
+                yield from self._read(name, storage, connections, wanted)
+
+    def _read(
+        self,
+        name: str,
+        storage: _Storage,
+        connections: Sequence[Connection],
+        wanted: dict[str, Topic],
+    ) -> Iterator[Recorded]:
+        for connection in connections:
+            _check_type(connection, wanted[connection.topic], self.path)
+        messages = storage.messages(connections)
+        while True:
+            try:
+                connection, received_ns, data = next(messages)
+            except StopIteration:
+                return
+            except Exception as exc:  # a damaged file makes the reader fail in any way it can
+                self.lost.append(f"{name}: unreadable from here on ({_reason(exc)})")
+                return
+            topic = wanted[connection.topic]
+            yield Recorded(topic, received_ns, _decode(data, topic, self.path))
+
+
+def _decode(data: bytes, topic: Topic, path: Path) -> Any:
+    try:
+        return typestore().deserialize_cdr(data, topic.msgtype)
+    except Exception as exc:
+        raise BagError(
+            f"{path}: a message of {len(data)} bytes on {topic.name} is no {topic.msgtype}: "
+            f"{_reason(exc)}"
+        ) from None
+
+
+def _check_type(connection: Connection, topic: Topic, path: Path) -> None:
+    if connection.msgtype != topic.msgtype:
+        raise BagError(
+            f"{path}: {connection.topic} is of type {connection.msgtype}; expected {topic.msgtype}"
+        )
+    expected = typestore().hash_rihs01(topic.msgtype)
+    if connection.digest.startswith("RIHS01_") and connection.digest != expected:
+        raise BagError(
+            f"{path}: {connection.topic} was recorded with another version of {topic.msgtype} "
+            f"({connection.digest[:15]}...); expected {expected[:15]}..."
+        )
+
+
+@contextmanager
+def open_bag(path: str | Path, namespace: str | None = None) -> Iterator[Bag]:
+    """Open a recording.
+
+    Parameters
+    ----------
+    path : path
+        A rosbag2 directory, or one ``.mcap`` or ``.db3`` file.
+    namespace : str, optional
+        Namespace of the rig, where the bag has several.
+
+    Raises
+    ------
+    BagError
+        When nothing can be read, or it is not clear which rig is meant.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise BagError(f"there is no bag {path}")
+    bag = Bag(path, "")
+    try:
+        _open_storages(bag)
+        bag.namespace = _namespace(bag, namespace)
+        yield bag
+    finally:
+        for _, storage in bag._storages:
+            storage.close()  # type: ignore[attr-defined]
+
+
+def _open_storages(bag: Bag) -> None:
+    """Open the bag as a whole; when that fails, every file of it that can be read."""
+    try:
+        bag._storages.append((bag.path.name, _opened(bag.path)))
+    except Exception as exc:
+        _refuse_formats(exc, bag.path)
+        no_metadata = isinstance(exc, FileNotFoundError)
+        why = "no metadata.yaml, read file by file" if no_metadata else _reason(exc)
+        bag.lost.append(f"{bag.path.name}: {why}")
+        for file in _files(bag.path):
+            _open_file(bag, file)
+        if not bag._storages:
+            raise BagError(
+                f"{bag.path} cannot be read: {'; '.join(bag.lost)}; expected a rosbag2 directory "
+                "or an .mcap or .db3 file"
+            ) from None
+
+
+def _refuse_formats(exc: Exception, path: Path) -> None:
+    """A bag that is whole but in a format we do not know is not to be read half."""
+    if isinstance(exc, ReaderError) and "not supported" in str(exc):
+        raise BagError(f"{path} cannot be read: {_reason(exc)}; expected cdr in mcap or sqlite3")
+
+
+def _opened(path: Path) -> _Storage:
+    reader = Reader(path)
+    reader.open()
+    _check_cdr(reader.connections)
+    return reader
+
+
+def _check_cdr(connections: Sequence[Connection]) -> None:
+    extensions = [c.ext for c in connections if isinstance(c.ext, ConnectionExtRosbag2)]
+    formats = {ext.serialization_format for ext in extensions}
+    if formats - {"cdr"}:
+        raise ReaderError(f"Serialization format {formats!r} is not supported.")
+
+
+def _files(path: Path) -> list[Path]:
+    if path.is_file():
+        return [path]
+    found = [p for p in path.iterdir() if p.suffix in (".mcap", ".db3") and p.is_file()]
+    return sorted(found, key=natural_key)
+
+
+def _open_file(bag: Bag, file: Path) -> None:
+    try:
+        bag._storages.append((file.name, _opened(file)))
+    except Exception as exc:
+        _refuse_formats(exc, file)
+        if file != bag.path:
+            bag.lost.append(f"{file.name}: {_reason(exc)}")
+        if file.suffix == ".mcap":
+            _open_mended(bag, file)
+
+
+def _open_mended(bag: Bag, file: Path) -> None:
+    mended = MendedPath(file)
+    if mended.intact == 0:
+        return
+    reader = _MendedMcap(mended)
+    try:
+        reader.open()
+        _check_cdr(reader.connections)
+    except Exception as exc:
+        _refuse_formats(exc, file)
+        bag.lost.append(f"{file.name}: {_reason(exc)}")
+        return
+    size = file.stat().st_size
+    bag.lost.append(
+        f"{file.name}: the end is missing; {size - mended.intact} of {size} bytes are unreadable"
+    )
+    bag._storages.append((file.name, reader))
+
+
+class _MendedMcap(McapReader):
+    """Reads records as they come: an mcap file without index need not be in order of time."""
+
+    def __init__(self, path: MendedPath) -> None:
+        super().__init__(path)  # type: ignore[arg-type]
+
+    def messages(
+        self,
+        connections: Any,
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Any:
+        return self.messages_scan(connections, start, stop)
+
+
+def _namespace(bag: Bag, wanted: str | None) -> str:
+    """Namespace of the rig in the bag: the one under which images or triggers were recorded."""
+    names = {c.topic for _, storage in bag._storages for c in storage.connections}
+    found = sorted(
+        {
+            name.removesuffix(f"/{topic.name}")
+            for name in names
+            for topic in (TRIGGER, IMAGE)
+            if name.endswith(f"/{topic.name}")
+        }
+    )
+    if wanted is not None:
+        return "/" + wanted.strip("/")
+    if len(found) > 1:
+        raise BagError(
+            f"{bag.path} has several rigs: {', '.join(found)}; expected one of them to be named"
+        )
+    return found[0] if found else DEFAULT_NAMESPACE
+
+
+def topic_names(bag: Bag) -> list[str]:
+    """All topics in the bag, sorted."""
+    return sorted({c.topic for _, storage in bag._storages for c in storage.connections})
+
+
+def _reason(exc: BaseException) -> str:
+    text = " ".join(str(exc).split()) or type(exc).__name__
+    return text if len(text) <= 200 else text[:197] + "..."
+
+
+def natural_key(path: Path) -> list[tuple[int, int | str]]:
+    """Sort key that puts ``frame_10`` after ``frame_9``."""
+    parts = re.split(r"(\d+)", path.name.lower())
+    return [(0, int(part)) if part.isdigit() else (1, part) for part in parts if part]

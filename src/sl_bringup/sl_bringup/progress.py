@@ -1,0 +1,74 @@
+"""What a command tells its user while it works: lines, and progress that overwrites itself."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import TracebackType
+
+_BAR = 24
+#: Redraws a second on a terminal; elsewhere (logs) a line every so many seconds.
+_REDRAW_S, _LOG_S = 0.1, 5.0
+
+
+def say(line: str) -> None:
+    """Write a line to standard output at once."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def complain(line: str) -> None:
+    """Write a line to standard error at once."""
+    sys.stderr.write(line + "\n")
+    sys.stderr.flush()
+
+
+class Progress:
+    """Progress of counted work on standard error; a bar on a terminal, lines in a log.
+
+    Parameters
+    ----------
+    what : str
+        The work.
+    total : int
+        Steps in all.
+    unit : str
+        What a step is.
+    """
+
+    def __init__(self, what: str, total: int, unit: str) -> None:
+        self._what, self._total, self._unit = what, max(total, 1), unit
+        self._done = 0
+        self._terminal = sys.stderr.isatty()
+        self._shown_s = time.monotonic()
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._terminal and self._done:
+            self._show()
+            sys.stderr.write("\n")
+
+    def step(self) -> None:
+        """One more is done."""
+        self._done += 1
+        now_s = time.monotonic()
+        if now_s - self._shown_s >= (_REDRAW_S if self._terminal else _LOG_S):
+            self._shown_s = now_s
+            self._show()
+
+    def _show(self) -> None:
+        done = min(self._done, self._total)
+        counted = f"{done}/{self._total} {self._unit}"
+        if self._terminal:
+            bar = "#" * (_BAR * done // self._total)
+            sys.stderr.write(f"\r{self._what} [{bar:<{_BAR}}] {counted}")
+        else:
+            sys.stderr.write(f"{self._what}: {counted}\n")
+        sys.stderr.flush()
