@@ -1,0 +1,108 @@
+"""Clouds as PLY and PCD files, both binary, lengths in metres.
+
+A cloud is a structured array (rows, columns) of ``x, y, z, intensity, sigma`` (float32), NaN where
+there is no point: one row per camera row, one column per DMD column boundary.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_projector.documents import written_atomically
+
+POINT_FIELDS = ("x", "y", "z", "intensity", "sigma")
+
+
+def present(points: NDArray[Any]) -> NDArray[Any]:
+    """Points that are there, (n,), in row order."""
+    flat = points.reshape(-1)
+    return np.asarray(flat[np.isfinite(flat["z"])])
+
+
+def save_ply(path: str | Path, points: NDArray[Any], notes: Mapping[str, str] | None = None) -> int:
+    """Write the points that are there as binary little-endian PLY.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    points : ndarray, structured
+        The cloud, any shape; NaN points are left out.
+    notes : mapping, optional
+        Written as comments, for example the hash of the calibration.
+
+    Returns
+    -------
+    int
+        Number of points written.
+    """
+    from plyfile import PlyData, PlyElement
+
+    kept = present(points)
+    comments = ["lengths in metres", *_lines(notes)]
+    vertices = np.empty(len(kept), dtype=[(name, "<f4") for name in POINT_FIELDS])
+    for name in POINT_FIELDS:
+        vertices[name] = kept[name]
+    element = PlyElement.describe(vertices, "vertex")
+    with written_atomically(Path(path)) as partial:
+        PlyData([element], byte_order="<", comments=comments).write(str(partial))
+    return len(kept)
+
+
+def save_pcd(
+    path: str | Path,
+    points: NDArray[Any],
+    notes: Mapping[str, str] | None = None,
+    organised: bool = False,
+) -> int:
+    """Write a cloud as binary PCD 0.7 (pointclouds.org/documentation/tutorials/pcd_file_format).
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    points : ndarray, structured
+        The cloud, (rows, columns).
+    notes : mapping, optional
+        Written as comments.
+    organised : bool
+        Keep rows and columns, with NaN where there is no point; else only points that are there.
+
+    Returns
+    -------
+    int
+        Number of points written, those that are NaN included.
+    """
+    kept = points if organised else present(points)[np.newaxis, :]
+    packed = np.empty(kept.shape, dtype=[(name, "<f4") for name in POINT_FIELDS])
+    for name in POINT_FIELDS:
+        packed[name] = kept[name]
+    height, width = packed.shape
+    lines = [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        *(f"# {line}" for line in ("lengths in metres", *_lines(notes))),
+        "VERSION 0.7",
+        f"FIELDS {' '.join(POINT_FIELDS)}",
+        f"SIZE {' '.join('4' for _ in POINT_FIELDS)}",
+        f"TYPE {' '.join('F' for _ in POINT_FIELDS)}",
+        f"COUNT {' '.join('1' for _ in POINT_FIELDS)}",
+        f"WIDTH {width}",
+        f"HEIGHT {height}",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {packed.size}",
+        "DATA binary",
+    ]
+    with written_atomically(Path(path)) as partial:
+        partial.write_bytes(("\n".join(lines) + "\n").encode("ascii") + packed.tobytes())
+    return int(packed.size)
+
+
+def _lines(notes: Mapping[str, str] | None) -> list[str]:
+    """One line of plain ASCII for each note."""
+    lines = (f"{key}: {value}" for key, value in (notes or {}).items())
+    return [" ".join(line.encode("ascii", "replace").decode().split()) for line in lines]

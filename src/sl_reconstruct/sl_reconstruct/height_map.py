@@ -1,0 +1,186 @@
+"""Height maps: z of an organised cloud at the nodes of a regular grid in x and y."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_projector.documents import written_atomically
+from sl_projector.errors import SlError, StackError
+
+#: Neighbours further apart than so many typical spacings lie on different sides of a step or gap.
+MAX_STRETCH = 4.0
+MAX_NODES = 16_000_000
+#: Spacings are measured on about so many neighbours.
+SAMPLES = 200_000
+
+
+@dataclass(frozen=True)
+class HeightMap:
+    """Heights on a grid whose first row has the largest y, so that it looks as the part does.
+
+    Parameters
+    ----------
+    z_m : ndarray, (rows, columns), float32
+        Heights in metres, NaN where nothing was measured.
+    x0_m, y0_m : float
+        Position of the upper left node, metres.
+    step_m : float
+        Distance of neighbouring nodes, metres; x grows with the column, y falls with the row.
+    """
+
+    z_m: NDArray[np.float32]
+    x0_m: float
+    y0_m: float
+    step_m: float
+
+    @property
+    def extent_m(self) -> tuple[float, float, float, float]:
+        """(left, right, bottom, top) of the outermost nodes, metres."""
+        rows, columns = self.z_m.shape
+        return (
+            self.x0_m, self.x0_m + (columns - 1) * self.step_m,
+            self.y0_m - (rows - 1) * self.step_m, self.y0_m,
+        )  # fmt: skip
+
+
+def typical_spacing_m(points: NDArray[Any]) -> float:
+    """Median distance of neighbours in x and y along rows and columns, the larger of the two.
+
+    NaN when no two neighbours are there.
+    """
+    spacings = []
+    for a, b in ((points[:, :-1], points[:, 1:]), (points[:-1], points[1:])):
+        stride = max(1, a.size // SAMPLES)
+        a, b = a.reshape(-1)[::stride], b.reshape(-1)[::stride]
+        apart = np.hypot(a["x"] - b["x"], a["y"] - b["y"])
+        apart = apart[np.isfinite(apart)]
+        spacings.append(float(np.median(apart)) if apart.size else np.nan)
+    return max(spacings)
+
+
+def make_height_map(points: NDArray[Any], step_m: float | None = None) -> HeightMap:
+    """Interpolate an organised cloud linearly at the nodes of a grid.
+
+    Each two triangles between four neighbours give z at the nodes under them. Triangles with a
+    missing corner give nothing, nor do those that bridge a gap (`MAX_STRETCH`): no height is
+    invented. Where triangles overlap, the highest counts.
+
+    Parameters
+    ----------
+    points : ndarray (rows, columns), structured
+        The cloud; ``x, y, z`` in metres, NaN where there is no point.
+    step_m : float, optional
+        Distance of nodes, metres; the typical spacing of the points when left out.
+
+    Raises
+    ------
+    StackError
+        When there are no two neighbouring points, or the grid would be too large.
+    """
+    spacing = typical_spacing_m(points)
+    if not spacing > 0:
+        raise StackError("the cloud has no two neighbouring points; expected a surface")
+    step = spacing if step_m is None else step_m
+    x, y = points["x"].astype(np.float64), points["y"].astype(np.float64)
+    x0, y0 = np.floor(np.nanmin(x) / step) * step, np.ceil(np.nanmax(y) / step) * step
+    columns = int(np.ceil((np.nanmax(x) - x0) / step)) + 1
+    rows = int(np.ceil((y0 - np.nanmin(y)) / step)) + 1
+    if rows * columns > MAX_NODES:
+        raise StackError(
+            f"a height map of {columns} x {rows} nodes {step:.3g} m apart is too large; expected "
+            f"at most {MAX_NODES} nodes (some points lie far off, or the step is too small)"
+        )
+    z = np.full((rows, columns), np.nan, dtype=np.float32)
+    limit = MAX_STRETCH * max(spacing, step)
+    _rasterise((x - x0) / step, (y0 - y) / step, points["z"].astype(np.float64), z, limit, step)
+    return HeightMap(z, float(x0), float(y0), float(step))
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _rasterise(
+    u: NDArray[np.float64],
+    v: NDArray[np.float64],
+    z: NDArray[np.float64],
+    out: NDArray[np.float32],
+    limit_m: float,
+    step_m: float,
+) -> None:
+    """Fill the nodes under all triangles; u and v in nodes, z and the limit in metres."""
+    rows, columns = z.shape
+    for r in range(rows - 1):
+        for c in range(columns - 1):
+            _triangle(u, v, z, out, limit_m, step_m, (r, c), (r, c + 1), (r + 1, c))
+            _triangle(u, v, z, out, limit_m, step_m, (r + 1, c + 1), (r + 1, c), (r, c + 1))
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _triangle(
+    u: NDArray[np.float64],
+    v: NDArray[np.float64],
+    z: NDArray[np.float64],
+    out: NDArray[np.float32],
+    limit_m: float,
+    step_m: float,
+    a: tuple[int, int],
+    b: tuple[int, int],
+    c: tuple[int, int],
+) -> None:
+    """Fill the nodes under one triangle, unless a corner is missing or it is stretched."""
+    if not (np.isfinite(z[a]) and np.isfinite(z[b]) and np.isfinite(z[c])):
+        return
+    longest = max(
+        max(abs(u[a] - u[b]), abs(u[b] - u[c]), abs(u[c] - u[a])),
+        max(abs(v[a] - v[b]), abs(v[b] - v[c]), abs(v[c] - v[a])),
+    )
+    if longest * step_m > limit_m:
+        return
+    area = (u[b] - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (v[b] - v[a])
+    if abs(area) < 1e-12:
+        return
+    eps = 1e-9
+    first_v, last_v = int(np.ceil(min(v[a], v[b], v[c]))), int(np.floor(max(v[a], v[b], v[c])))
+    first_u, last_u = int(np.ceil(min(u[a], u[b], u[c]))), int(np.floor(max(u[a], u[b], u[c])))
+    for j in range(max(first_v, 0), min(last_v, out.shape[0] - 1) + 1):
+        for i in range(max(first_u, 0), min(last_u, out.shape[1] - 1) + 1):
+            wb = ((i - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (j - v[a])) / area
+            wc = ((u[b] - u[a]) * (j - v[a]) - (i - u[a]) * (v[b] - v[a])) / area
+            if wb >= -eps and wc >= -eps and wb + wc <= 1 + eps:
+                height = z[a] + wb * (z[b] - z[a]) + wc * (z[c] - z[a])
+                if not out[j, i] >= height:
+                    out[j, i] = height
+
+
+def save_tiff(path: str | Path, height: HeightMap) -> None:
+    """Write a height map as 32-bit float TIFF: metres, NaN where nothing was measured."""
+    _write(Path(path), height.z_m)
+
+
+def save_png(path: str | Path, height: HeightMap) -> tuple[float, float]:
+    """Write a height map as 16-bit grey PNG: 0 is missing, 1 to 65535 from lowest to highest.
+
+    Returns
+    -------
+    tuple of float
+        Heights of the values 1 and 65535, metres.
+    """
+    z = height.z_m
+    there = np.isfinite(z)
+    low, high = (float(z[there].min()), float(z[there].max())) if there.any() else (0.0, 0.0)
+    scale = 65534.0 / (high - low) if high > low else 0.0
+    grey = np.zeros(z.shape, dtype=np.uint16)
+    grey[there] = np.rint((z[there].astype(np.float64) - low) * scale).astype(np.uint16) + 1
+    _write(Path(path), grey)
+    return low, high
+
+
+def _write(path: Path, image: NDArray[Any]) -> None:
+    with written_atomically(path) as partial:
+        if not cv2.imwrite(str(partial), image):
+            raise SlError(f"cannot write the image {path}")
