@@ -1,0 +1,235 @@
+"""The stage's node: where the part stands, and services that move it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from sl_interfaces.srv import MoveStage
+from std_srvs.srv import Trigger
+
+from sl_camera.grbl import GrblStage
+from sl_camera.messages import stage_pose
+from sl_camera.stage import Position, StageDriver, StageState
+from sl_projector.base_node import EVENTS, WORLD_FRAME, Health, RigNode, run
+from sl_projector.device_link import DeviceLink
+from sl_projector.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout, SlError
+
+#: While it moves, a position is at most so old (`StageDriver.position_m`).
+MOVING_AGE_NS = 200_000_000
+
+_LEVELS = {"idle": "ok", "moving": "ok", "homing": "ok", "hold": "warn", "not_homed": "warn"}
+
+
+class StageNode(RigNode):
+    """Drives one stage.
+
+    Parameters
+    ----------
+    make_driver : callable, optional
+        Makes the (closed) driver; by default GRBL on the port that the parameters name.
+    options
+        Passed to `rclpy.node.Node`.
+    """
+
+    def __init__(
+        self, make_driver: Callable[[], StageDriver] | None = None, **options: Any
+    ) -> None:
+        super().__init__("stage", **options)
+        self._declare_parameters()
+        self._make_driver = make_driver or self._make_grbl
+        self._moves = 0
+        self._state = StageState("lost", "not connected yet")
+        self._stop = threading.Event()
+        self._poses = self.create_publisher(PoseStamped, "stage/pose", EVENTS)
+        self._serve(MoveStage, "stage/move", self._move)
+        self._serve(Trigger, "stage/home", self._home)
+        self._serve(Trigger, "stage/stop", self._halt)
+        self._serve(Trigger, "stage/clear", self._clear)
+        self._link = DeviceLink("stage", self._connect, self.get_logger().info)
+        self._link.start()
+        self._poller = threading.Thread(target=self._poll, name="stage pose", daemon=True)
+        self._poller.start()
+
+    def _declare_parameters(self) -> None:
+        self._port = self.declare("port", "", "serial port, such as /dev/ttyUSB0")
+        self._baud = self.declare("baud", 115200, "bits per second", 1200, 4_000_000)
+        self._origin_mm = self.declare(
+            "origin_mm", "", "GRBL machine position of the stage's zero, 'x y z' in mm; empty: the "
+            "middle of the travel",
+        )  # fmt: skip
+        self._signs = self.declare(
+            "signs", [1, 1, 1], "direction of the stage's axes in machine coordinates, +1 or -1"
+        )
+        self._speed_m_s = self.declare(
+            "speed_m_s", 0.0, "speed of moves, m/s; 0: the controller's limit", 0.0, 1.0
+        )
+        self._home_at_start = self.declare("home_at_start", False, "home after connecting")
+        self._period_s = 1.0 / self.declare("pose_rate_hz", 20.0, "poses a second", 1.0, 100.0)
+
+    def health(self) -> Health:
+        """What the stage is doing, in the driver's words."""
+        state = self._state
+        level = _LEVELS.get(state.kind, "error")
+        message = f"{state.kind}: {state.text}" if state.text else state.kind
+        if not self._link.connected:
+            level, message = "error", self._link.reason
+        values: dict[str, object] = {
+            "referenced": state.referenced,
+            "times lost": self._link.losses,
+        }
+        return Health(level, message, "stage", self._port, values)
+
+    def close(self) -> None:
+        """Stop a running move and give the port back."""
+        self._stop.set()
+        self._link.close()
+        self._poller.join(timeout=5.0)
+        super().close()
+
+    def _make_grbl(self) -> StageDriver:
+        if not self._port:
+            raise ConfigError("the parameter port is empty; expected a serial port")
+        x, y, z = self._signs
+        return GrblStage(
+            self._port,
+            baud=self._baud,
+            origin_mm=parse_origin(self._origin_mm),
+            signs=(x, y, z),
+            speed_m_s=self._speed_m_s or None,
+        )
+
+    def _connect(self) -> StageDriver:
+        driver = self._make_driver()
+        try:
+            driver.open()
+            if self._home_at_start and driver.state().kind in ("not_homed", "idle"):
+                self.get_logger().info("homing the stage")
+                driver.home()
+        except SlError:
+            driver.close()
+            raise
+        return driver
+
+    # -- pose -------------------------------------------------------------------------------
+
+    def _poll(self) -> None:
+        """Read and publish the pose; a stage that is gone is noticed here."""
+        while not self._stop.wait(self._period_s):
+            if not self._link.connected:
+                continue
+            driver = self._link.device()
+            try:
+                self._publish_pose(driver)
+            except DeviceError as error:
+                self._check_lost(driver, error)
+
+    def _publish_pose(self, driver: StageDriver) -> None:
+        """No pose in an alarm, while homing or without a device: then it is not known."""
+        before_ns, moves = time.time_ns(), self._moves
+        self._state = driver.state()
+        if self._state.kind == "lost":
+            raise DeviceLost(self._state.text)
+        if self._state.kind in ("alarm", "homing"):
+            return
+        position_m = driver.position_m()
+        moving = moves or self._moves or self._state.kind != "idle"
+        self._poses.publish(self._pose(position_m, before_ns - (MOVING_AGE_NS if moving else 0)))
+
+    def _pose(self, position_m: Position, stamp_ns: int) -> PoseStamped:
+        return stage_pose(position_m, stamp_ns, WORLD_FRAME)
+
+    def _check_lost(self, driver: StageDriver, error: DeviceError) -> None:
+        self.last_error = str(error)
+        if isinstance(error, DeviceLost) or driver.state().kind == "lost":
+            self._link.lost(driver, error)
+
+    # -- services ---------------------------------------------------------------------------
+
+    def _serve(self, kind: Any, name: str, work: Callable[[StageDriver, Any, Any], None]) -> None:
+        """Offer a service whose work blocks; what goes wrong becomes its answer."""
+
+        async def handle(request: Any, response: Any) -> Any:
+            def do() -> None:
+                work(self._link.device(), request, response)
+
+            try:
+                await self.in_worker(do)
+            except SlError as error:
+                response.success, response.message = False, str(error)
+                self.get_logger().error(f"{name} failed: {error}")
+                self._notice(error)
+            except Exception as error:  # the caller gets an answer whatever happens
+                response.success, response.message = False, f"internal fault: {error!r}"
+                self.get_logger().error(f"{name} failed: {error!r}")
+            return response
+
+        self.create_service(kind, name, handle, callback_group=self.long_work)
+
+    def _notice(self, error: SlError) -> None:
+        """A service that lost the device leaves it to be opened anew."""
+        if isinstance(error, (DeviceLost, DeviceTimeout)) and self._link.connected:
+            driver = self._link.device()
+            if driver.state().kind == "lost":
+                self._link.lost(driver, error)
+
+    def _move(self, driver: StageDriver, request: Any, response: Any) -> None:
+        target_m = (request.target.x, request.target.y, request.target.z)
+        if request.relative:
+            x, y, z = (a + b for a, b in zip(driver.position_m(), target_m, strict=True))
+            target_m = (x, y, z)
+        driver.limits_m().require_inside(target_m)
+        self._moves += 1
+        try:
+            driver.move_to(*target_m)
+        finally:
+            self._moves -= 1
+        response.pose = self._pose(driver.position_m(), time.time_ns())
+        response.success = True
+        response.message = "moved to " + ", ".join(f"{1e3 * a:.4f}" for a in target_m) + " mm"
+
+    def _home(self, driver: StageDriver, _request: Any, response: Any) -> None:
+        self._moves += 1
+        try:
+            driver.home()
+        finally:
+            self._moves -= 1
+        response.success, response.message = True, "homed"
+
+    def _halt(self, driver: StageDriver, _request: Any, response: Any) -> None:
+        driver.stop()
+        response.success, response.message = True, "stopped"
+
+    def _clear(self, driver: StageDriver, _request: Any, response: Any) -> None:
+        driver.clear()
+        state = driver.state()
+        response.success, response.message = True, f"cleared: {state.kind} {state.text}".rstrip()
+
+
+def parse_origin(text: str) -> Position | None:
+    """Read 'x y z' in millimetres; None for an empty text.
+
+    Raises
+    ------
+    ConfigError
+        When these are not three numbers.
+    """
+    if not text.strip():
+        return None
+    try:
+        x, y, z = (float(word) for word in text.replace(",", " ").split())
+    except ValueError:
+        raise ConfigError(f"origin_mm={text!r}; expected three numbers in mm") from None
+    return x, y, z
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run the node."""
+    run(StageNode, args)
+
+
+if __name__ == "__main__":
+    main()

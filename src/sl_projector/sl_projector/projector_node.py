@@ -1,0 +1,264 @@
+"""The projector's node: projects named sequences and announces every exposed pattern."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from sensor_msgs.msg import CameraInfo
+from sl_interfaces.msg import PatternTrigger, RigCalibration
+from sl_interfaces.srv import Project
+
+from sl_projector.base_node import (
+    EVENTS,
+    LATCHED,
+    PROJECTOR_FRAME,
+    Health,
+    RigNode,
+    device_health,
+    next_scan_id,
+    run,
+)
+from sl_projector.device_link import DeviceLink
+from sl_projector.dlpc900 import Dlpc900, Dlpc900Settings
+from sl_projector.dmd import (
+    DEFAULT_MODEL,
+    MODELS,
+    ProjectorDriver,
+    ProjectorStatus,
+    RunInfo,
+    Timing,
+    dmd_model,
+)
+from sl_projector.errors import ConfigError, DeviceLost, DeviceTimeout, SequenceError, SlError
+from sl_projector.messages import trigger_to_msg
+from sl_projector.sequence import NAMED, PatternSequence, named
+from sl_projector.sequence_file import load_sequence
+
+MAX_SCAN_ID = 0xFFFFFFFF
+
+
+def find_in_directory(name: str, directory: str, dmd_size: tuple[int, int]) -> PatternSequence:
+    """Return a built-in sequence, or one from a file that lies directly in a directory.
+
+    Anyone in the ROS domain can call the service, so a name never leads out of the directory.
+
+    Raises
+    ------
+    SequenceError
+        When there is none of that name, or its file cannot be used.
+    """
+    if name in NAMED:
+        return named(name, dmd_size)
+    if not directory:
+        raise SequenceError(
+            f"no sequence is called {name!r}; expected one of {sorted(NAMED)} "
+            "(the projector's parameter sequence_dir is empty, so files cannot be named)"
+        )
+    files = {file.name: file for file in Path(directory).glob("*.y*ml") if file.is_file()}
+    found = files.get(name) or files.get(f"{name}.yaml")
+    if found is None:
+        raise SequenceError(
+            f"no sequence is called {name!r}; expected one of {sorted(NAMED)} or of the files "
+            f"{sorted(files)} in sequence_dir"
+        )
+    return load_sequence(found)
+
+
+class ProjectorNode(RigNode):
+    """Drives one DMD.
+
+    Parameters
+    ----------
+    make_driver : callable, optional
+        Makes the (closed) driver of a DMD; by default TI's DLPC900 over USB, as the parameters say.
+    options
+        Passed to `rclpy.node.Node`.
+    """
+
+    def __init__(
+        self, make_driver: Callable[[], ProjectorDriver] | None = None, **options: Any
+    ) -> None:
+        super().__init__("projector", **options)
+        self._declare_parameters()
+        self._make_driver = make_driver or self._make_dlpc900
+        self._busy = threading.Lock()
+        self._stop = threading.Event()
+        self._showing = ""
+        self._last_id = 0
+        self._last_run = time.monotonic()
+        self._status: ProjectorStatus | None = None
+        self._triggers = self.create_publisher(PatternTrigger, "projector/trigger", EVENTS)
+        self._camera_info = self.create_publisher(CameraInfo, "projector/camera_info", LATCHED)
+        self.subscribe(RigCalibration, "calibration/rig", self._on_calibration, LATCHED)
+        self.create_service(
+            Project, "projector/project", self._project, callback_group=self.long_work
+        )
+        self._link = DeviceLink("projector", self._connect, self.get_logger().info)
+        self._link.start()
+        self._poller = threading.Thread(target=self._poll, name="projector status", daemon=True)
+        self._poller.start()
+
+    def _declare_parameters(self) -> None:
+        self._model = dmd_model(
+            self.declare("dmd_model", DEFAULT_MODEL, f"DMD: one of {sorted(MODELS)}")
+        )
+        self._device = self.declare(
+            "device", "usb", "usb, usb:SERIAL, or socket:PATH for one that another process serves"
+        )
+        self._leds = self.declare("leds", 7, "LEDs: 1 red + 2 green + 4 blue", 0, 7)
+        self.declare("sequence", "precise", "sequence of a request that names none", live=True)
+        self._directory = self.declare(
+            "sequence_dir", "", "directory whose sequence files may be asked for by name"
+        )
+        self.declare("exposure_s", 0.010, "exposure of each pattern, s", 1e-5, 16.0, live=True)
+        self.declare("dark_s", 0.010, "dark time after each exposure, s", 0.0, 16.0, live=True)
+        self._idle_after_s = self.declare(
+            "idle_after_s", 300.0, "without a scan for so long the mirrors are spared, s", 1.0, 1e6
+        )
+
+    def health(self) -> Health:
+        """Device, what it shows, what it complains about."""
+        level, message = device_health(self._link.connected, self._link.reason)
+        status = self._status
+        values: dict[str, object] = {"showing": self._showing or "nothing"}
+        if status is not None and self._link.connected:
+            values |= {"model": status.model, "firmware": status.firmware, "power": status.power}
+            if status.problems:
+                level, message = "error", "; ".join(status.problems)
+        values["times lost"] = self._link.losses
+        return Health(level, message, self._model.name, self._device, values)
+
+    def close(self) -> None:
+        """Stop the mirrors and give the device back."""
+        self._stop.set()
+        self._link.close()
+        self._poller.join(timeout=5.0)
+        super().close()
+
+    def _make_dlpc900(self) -> ProjectorDriver:
+        return Dlpc900(self._device, self._model, Dlpc900Settings(leds=self._leds))
+
+    def _connect(self) -> ProjectorDriver:
+        driver = self._make_driver()
+        try:
+            driver.open()
+        except SlError:
+            driver.close()
+            raise
+        return driver
+
+    def _poll(self) -> None:
+        """Ask the device once a second how it is; a device that is gone is noticed here."""
+        while not self._stop.wait(1.0):
+            if not self._link.connected:
+                continue
+            driver = self._link.device()
+            try:
+                self._status = driver.status()
+                self._spare_mirrors(driver)
+            except SlError as error:
+                self._check_lost(driver, error)
+
+    def _spare_mirrors(self, driver: ProjectorDriver) -> None:
+        if time.monotonic() - self._last_run < self._idle_after_s:
+            return
+        if self._busy.acquire(blocking=False):
+            try:
+                driver.idle()
+                self._last_run = time.monotonic()
+            finally:
+                self._busy.release()
+
+    def _check_lost(self, driver: ProjectorDriver, error: SlError) -> None:
+        """Open the device anew when it is gone or silent; other errors concern the request only."""
+        self.last_error = str(error)
+        if isinstance(error, (DeviceLost, DeviceTimeout)):
+            self._link.lost(driver, error)
+
+    def _on_calibration(self, message: RigCalibration) -> None:
+        info = message.projector
+        info.header.frame_id = PROJECTOR_FRAME
+        info.header.stamp = message.header.stamp
+        self._camera_info.publish(info)
+
+    async def _project(self, request: Any, response: Any) -> Any:
+        if not self._busy.acquire(blocking=False):
+            response.message = f"the projector is busy: it shows {self._showing}"
+            return response
+        try:
+            await self.in_worker(lambda: self._show(request, response))
+        except SlError as error:
+            response.success, response.message = False, str(error)
+            self.get_logger().error(f"projection failed: {error}")
+        except Exception as error:  # the caller gets an answer whatever happens
+            response.success, response.message = False, f"internal fault: {error!r}"
+            self.get_logger().error(f"projection failed: {error!r}")
+        finally:
+            self._showing = ""
+            self._busy.release()
+        return response
+
+    def _show(self, request: Any, response: Any) -> None:
+        """Load, start, announce each pattern as it is exposed, wait for the end."""
+        driver = self._link.device()
+        sequence = self._sequence(request.sequence)
+        timing = self._timing(request.exposure_s)
+        response.scan_id = self._take_id(request.scan_id)
+        self._showing = f"{sequence.name} for scan {response.scan_id}"
+        try:
+            driver.load(sequence, timing)
+            info = driver.run(timing)
+            self._last_run = time.monotonic()
+            response.count = self._announce(sequence, response.scan_id, info)
+            driver.wait()
+        except SlError as error:
+            self._check_lost(driver, error)
+            raise
+        response.success = True
+        response.message = f"{response.count} patterns of {sequence.name} shown"
+
+    def _sequence(self, name: str) -> PatternSequence:
+        wanted = name or str(self.get_parameter("sequence").value)
+        sequence = find_in_directory(wanted, self._directory, self._model.size)
+        if sequence.dmd_size != self._model.size:
+            raise SequenceError(
+                f"sequence {wanted!r} is made for a DMD of {sequence.dmd_size}; expected "
+                f"{self._model.size}, the {self._model.name}'s"
+            )
+        return sequence
+
+    def _timing(self, exposure_s: float) -> Timing:
+        if not 0.0 <= exposure_s <= 16.0:
+            raise ConfigError(f"exposure_s={exposure_s}; expected 0 (the default) to 16 s")
+        exposure = exposure_s or float(self.get_parameter("exposure_s").value)
+        return Timing(exposure, float(self.get_parameter("dark_s").value))
+
+    def _take_id(self, wanted: int) -> int:
+        self._last_id = wanted or next_scan_id(self._last_id)
+        return self._last_id
+
+    def _announce(self, sequence: PatternSequence, scan_id: int, info: RunInfo) -> int:
+        """Publish each trigger when its exposure begins; return how many were."""
+        for index in range(len(sequence)):
+            start_ns = info.start_ns + round(index * info.timing.period_s * 1e9)
+            if self._stop.wait(max(0.0, (start_ns - time.time_ns()) * 1e-9)):
+                raise DeviceLost("the projector node was stopped during the projection")
+            self._triggers.publish(
+                trigger_to_msg(
+                    sequence, index, scan_id, start_ns, info.timing.exposure_s, PROJECTOR_FRAME
+                )
+            )
+        return len(sequence)
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run the node."""
+    run(ProjectorNode, args)
+
+
+if __name__ == "__main__":
+    main()
