@@ -1,0 +1,193 @@
+"""Straight motion with a trapezoidal speed profile, as GRBL's planner makes it.
+
+Every block starts and ends at rest: a stage is sent from place to place, so the corner speeds of
+GRBL's look-ahead do not matter here. Lengths in millimetres, times in seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """From rest to rest over a length: accelerate, cruise, decelerate."""
+
+    length: float
+    speed: float
+    acceleration: float
+
+    @property
+    def peak(self) -> float:
+        """Highest speed reached; short moves never cruise."""
+        return min(self.speed, math.sqrt(self.length * self.acceleration))
+
+    @property
+    def duration(self) -> float:
+        """Length over peak speed, plus one acceleration time."""
+        if self.length == 0.0:
+            return 0.0
+        return self.length / self.peak + self.peak / self.acceleration
+
+    def at(self, t: float) -> tuple[float, float]:
+        """Distance and speed at time ``t`` after the start, clamped to both ends."""
+        if t >= self.duration:
+            return self.length, 0.0
+        t = max(t, 0.0)
+        ramp_s = self.peak / self.acceleration
+        left = self.duration - t
+        if t < ramp_s:
+            return 0.5 * self.acceleration * t * t, self.acceleration * t
+        if left < ramp_s:
+            return self.length - 0.5 * self.acceleration * left * left, self.acceleration * left
+        return self.peak * (t - 0.5 * ramp_s), self.peak
+
+
+@dataclass(frozen=True)
+class Braking:
+    """From a speed to rest."""
+
+    speed: float
+    acceleration: float
+
+    @property
+    def duration(self) -> float:
+        """Time to rest."""
+        return self.speed / self.acceleration
+
+    def at(self, t: float) -> tuple[float, float]:
+        """Distance and speed at time ``t`` after the braking began, clamped to rest."""
+        t = min(max(t, 0.0), self.duration)
+        return (self.speed - 0.5 * self.acceleration * t) * t, self.speed - self.acceleration * t
+
+
+@dataclass(frozen=True)
+class Block:
+    """A line in the planner.
+
+    Parameters
+    ----------
+    start, target : tuple of float
+        Machine position, mm.
+    speed : float
+        Programmed speed, mm/s; infinite for a rapid move.
+    is_jog : bool
+        It came from ``$J=``.
+    """
+
+    start: Triple
+    target: Triple
+    speed: float
+    is_jog: bool
+
+    @property
+    def length(self) -> float:
+        """Length of the line, mm."""
+        return math.dist(self.start, self.target)
+
+    def ramp(self, done: float, rates: Triple, accelerations: Triple) -> Ramp:
+        """Profile of what is left after ``done`` mm, within each axis' rate and acceleration."""
+        shares = [abs(b - a) / self.length for a, b in zip(self.start, self.target, strict=True)]
+        speed = min(r / s for r, s in zip(rates, shares, strict=True) if s > 0)
+        acceleration = min(a / s for a, s in zip(accelerations, shares, strict=True) if s > 0)
+        return Ramp(self.length - done, min(speed, self.speed), acceleration)
+
+    def point(self, done: float) -> Triple:
+        """Position after ``done`` mm."""
+        share = done / self.length
+        x, y, z = (a + share * (b - a) for a, b in zip(self.start, self.target, strict=True))
+        return x, y, z
+
+
+@dataclass(frozen=True)
+class HomingLeg:
+    """One leg of a homing cycle: every axis at its own constant rate, or a pause.
+
+    Parameters
+    ----------
+    start, target : tuple of float
+        Place of the carriage, mm.
+    rate : float
+        mm/s of each axis that moves.
+    pause_s : float
+        Debounce time after the leg.
+    alarm : int
+        Alarm that the leg ends in; 0 for none.
+    """
+
+    start: Triple
+    target: Triple
+    rate: float
+    pause_s: float
+    alarm: int = 0
+
+    @property
+    def duration(self) -> float:
+        """Time of the leg with its pause."""
+        longest = max(abs(b - a) for a, b in zip(self.start, self.target, strict=True))
+        return longest / self.rate + self.pause_s
+
+    def at(self, t: float) -> Triple:
+        """Place at time ``t`` after the leg began."""
+        run = self.rate * max(t, 0.0)
+        x, y, z = (
+            a + math.copysign(min(run, abs(b - a)), b - a)
+            for a, b in zip(self.start, self.target, strict=True)
+        )
+        return x, y, z
+
+
+def homing_legs(
+    place: Triple, settings: dict[int, float], dead_switches: frozenset[int]
+) -> list[HomingLeg]:
+    """Legs of ``$H`` from where the carriage stands: Z, then X and Y together.
+
+    Seek the switch at ``$25``, pull off by ``$27``, locate it at ``$24``, pull off; ``$26`` after
+    each. Switches are at 0, or at -travel for the axes in ``$23``. An axis whose switch is dead
+    ends the cycle with alarm 9 after 1.5 times its travel.
+    """
+    seek, locate = settings[25] / 60.0, settings[24] / 60.0
+    legs: list[HomingLeg] = []
+    for axes in ((2,), (0, 1)):
+        dead = [axis for axis in axes if axis in dead_switches]
+        if dead:
+            away = _with(
+                place, dead, lambda i, p: p + 1.5 * _towards(i, settings) * settings[130 + i]
+            )
+            legs.append(HomingLeg(place, away, seek, 0.0, alarm=9))
+            return legs
+        at_switch = _with(place, axes, lambda i, _: _switch(i, settings))
+        pulled = _with(place, axes, lambda i, _: _pulled_off(i, settings))
+        stops = (at_switch, pulled, at_switch, pulled)
+        for target, rate in zip(stops, (seek, seek, locate, seek), strict=True):
+            legs.append(HomingLeg(place, target, rate, settings[26] * 1e-3))
+            place = target
+    return legs
+
+
+def homed_position(settings: dict[int, float]) -> Triple:
+    """Machine position after homing: the pull-off away from the switch."""
+    return _with((0.0, 0.0, 0.0), (0, 1, 2), lambda i, _: _pulled_off(i, settings))
+
+
+def _towards(axis: int, settings: dict[int, float]) -> float:
+    return -1.0 if int(settings[23]) >> axis & 1 else 1.0
+
+
+def _switch(axis: int, settings: dict[int, float]) -> float:
+    return -settings[130 + axis] if _towards(axis, settings) < 0 else 0.0
+
+
+def _pulled_off(axis: int, settings: dict[int, float]) -> float:
+    return _switch(axis, settings) - _towards(axis, settings) * settings[27]
+
+
+def _with(place: Triple, axes: Sequence[int], new: Callable[[int, float], float]) -> Triple:
+    values = list(place)
+    for axis in axes:
+        values[axis] = new(axis, values[axis])
+    return values[0], values[1], values[2]
