@@ -1,0 +1,233 @@
+"""The camera's node: every frame as an image with its camera info, and what got lost."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import replace
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo, Image
+from sl_interfaces.msg import PatternTrigger, RigCalibration
+from std_srvs.srv import Trigger
+
+from sl_camera.camera import (
+    PIXEL_DTYPES,
+    TRIGGER_MODES,
+    CameraDriver,
+    CameraSettings,
+    CameraStatistics,
+    Frame,
+    FrameStatus,
+)
+from sl_camera.messages import camera_info_for, image_to_msg
+from sl_camera.socket_camera import SocketCamera
+from sl_projector.base_node import (
+    CAMERA_FRAME,
+    EVENTS,
+    IMAGES,
+    LATCHED,
+    Health,
+    RigNode,
+    device_health,
+    run,
+)
+from sl_projector.device_link import DeviceLink
+from sl_projector.errors import DeviceError, DeviceRefused, SlError
+
+READ_TIMEOUT_S = 0.1
+SETTING_TIMEOUT_S = 3.0
+_LIVE = ("exposure_s", "gain")
+
+
+class CameraNode(RigNode):
+    """Drives one camera; it is armed from when it is connected, so no trigger is missed.
+
+    Parameters
+    ----------
+    make_driver : callable, optional
+        Makes the (closed) driver; by default as the parameters say.
+    options
+        Passed to `rclpy.node.Node`.
+    """
+
+    def __init__(
+        self, make_driver: Callable[[], CameraDriver] | None = None, **options: Any
+    ) -> None:
+        super().__init__("camera", **options)
+        self._settings = self._declare_settings()
+        self._address = self.declare("address", "", "where the camera is served: socket path")
+        self._make_driver = make_driver or self._make_socket_camera
+        self._calibrated: CameraInfo | None = None
+        self._statistics = CameraStatistics()
+        self._orders: SimpleQueue[tuple[CameraSettings, Future[None]]] = SimpleQueue()
+        self._stop = threading.Event()
+        self._images = self.create_publisher(Image, "camera/image_raw", IMAGES)
+        self._infos = self.create_publisher(CameraInfo, "camera/camera_info", IMAGES)
+        self.subscribe(RigCalibration, "calibration/rig", self._on_calibration, LATCHED)
+        if self._settings.trigger == "software":
+            self.subscribe(PatternTrigger, "projector/trigger", self._on_trigger, EVENTS)
+        self.create_service(Trigger, "camera/trigger", self._trigger)
+        self.add_on_set_parameters_callback(self._on_parameters)
+        self._link = DeviceLink("camera", self._connect, self.get_logger().info)
+        self._link.start()
+        self._reader = threading.Thread(target=self._read, name="camera frames", daemon=True)
+        self._reader.start()
+
+    def _declare_settings(self) -> CameraSettings:
+        default = CameraSettings()
+        region = self.declare(
+            "region", [0, 0, 0, 0], "x, y, width, height, pixels; width 0: the whole sensor"
+        )
+        return CameraSettings(
+            exposure_s=self.declare(
+                "exposure_s", default.exposure_s, "exposure, s", 1e-6, 60.0, live=True
+            ),
+            gain=self.declare("gain", default.gain, "gain factor", 1e-3, 1e3, live=True),
+            trigger=self.declare("trigger", default.trigger, f"one of {TRIGGER_MODES}"),
+            region=tuple(region) if region[2] else None,
+            pixel_format=self.declare(
+                "pixel_format", default.pixel_format, f"one of {sorted(PIXEL_DTYPES)}"
+            ),
+        )
+
+    def health(self) -> Health:
+        """Device and counts; frames lost since the last report are a warning."""
+        level, message = device_health(self._link.connected, self._link.reason)
+        found, self._statistics = self._statistics, self._read_statistics()
+        lost = self._statistics.lost + self._statistics.incomplete - found.lost - found.incomplete
+        if level == "ok" and lost > 0:
+            level, message = "warn", f"{lost} frames lost or incomplete in the last second"
+        values: dict[str, object] = {
+            "frames": self._statistics.received,
+            "frames lost": self._statistics.lost,
+            "frames incomplete": self._statistics.incomplete,
+            "times lost": self._link.losses + self._statistics.reconnects,
+            "exposure_s": self._settings.exposure_s,
+            "trigger": self._settings.trigger,
+        }
+        return Health(level, message, "camera", self._address, values)
+
+    def close(self) -> None:
+        """Stop reading and give the camera back."""
+        self._stop.set()
+        self._reader.join(timeout=5.0)
+        self._link.close()
+        super().close()
+
+    def _read_statistics(self) -> CameraStatistics:
+        try:
+            return self._link.device().statistics()
+        except DeviceError:
+            return self._statistics
+
+    def _make_socket_camera(self) -> CameraDriver:
+        return SocketCamera(self._address)
+
+    def _connect(self) -> CameraDriver:
+        driver = self._make_driver()
+        try:
+            driver.open()
+            driver.configure(self._settings)
+            driver.arm()
+        except SlError:
+            driver.close()
+            raise
+        return driver
+
+    # -- frames -----------------------------------------------------------------------------
+
+    def _read(self) -> None:
+        """Publish frames as they come. This thread alone reads and configures the camera."""
+        while not self._stop.is_set():
+            self._obey()
+            if not self._link.connected:
+                self._stop.wait(READ_TIMEOUT_S)
+                continue
+            driver = self._link.device()
+            try:
+                frame = driver.read(READ_TIMEOUT_S)
+            except Exception as error:  # whatever went wrong, a fresh connection is the answer
+                self._link.lost(driver, error)
+                continue
+            if frame is not None and not self._stop.is_set():
+                self._publish(frame)
+
+    def _publish(self, frame: Frame) -> None:
+        """Publish whole frames; half a frame would become wrong points."""
+        if frame.status is not FrameStatus.OK:
+            self.get_logger().warning(f"frame {frame.frame_id} came incomplete, thrown away")
+            return
+        image = image_to_msg(frame.image, frame.stamp_ns, CAMERA_FRAME)
+        self._images.publish(image)
+        self._infos.publish(camera_info_for(self._calibrated, image))
+
+    def _on_calibration(self, message: RigCalibration) -> None:
+        self._calibrated = message.camera
+
+    # -- triggering and settings --------------------------------------------------------------
+
+    def _on_trigger(self, _message: PatternTrigger) -> None:
+        self._link.device().software_trigger()
+
+    def _trigger(self, _request: Any, response: Any) -> Any:
+        try:
+            self._link.device().software_trigger()
+            response.success, response.message = True, "triggered"
+        except SlError as error:
+            response.success, response.message = False, str(error)
+        return response
+
+    def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        changes = {p.name: p.value for p in parameters if p.name in _LIVE}
+        if not changes:
+            return SetParametersResult(successful=True)
+        try:
+            order: Future[None] = Future()
+            self._orders.put((replace(self._settings, **changes), order))
+            order.result(timeout=SETTING_TIMEOUT_S)
+        except (SlError, TimeoutError) as error:
+            return SetParametersResult(successful=False, reason=str(error) or "no answer in time")
+        return SetParametersResult(successful=True)
+
+    def _obey(self) -> None:
+        """Apply new settings between two frames; without a device they wait for it."""
+        try:
+            settings, order = self._orders.get_nowait()
+        except Empty:
+            return
+        fault: SlError | None = None
+        if self._link.connected:
+            fault = self._configure(self._link.device(), settings)
+        if fault is None:
+            self._settings = settings
+            order.set_result(None)
+        else:
+            order.set_exception(fault)
+
+    def _configure(self, driver: CameraDriver, settings: CameraSettings) -> SlError | None:
+        """Configure and arm; after a refusal the camera is as before, and armed again."""
+        fault: SlError | None = None
+        try:
+            try:
+                driver.configure(settings)
+            except DeviceRefused as refusal:
+                fault = refusal
+            driver.arm()
+        except DeviceError as error:
+            self._link.lost(driver, error)
+            fault = error
+        return fault
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run the node."""
+    run(CameraNode, args)
+
+
+if __name__ == "__main__":
+    main()

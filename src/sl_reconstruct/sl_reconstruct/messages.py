@@ -1,0 +1,234 @@
+"""Stacks, clouds and rigs as ROS messages and back; what comes in is checked.
+
+Pixels and points are not copied here: a stack is a view into its message, and a cloud's message
+shares the cloud's memory until it is published (rclpy serialises anything with a buffer).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Pose
+from numpy.typing import NDArray
+from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
+from sl_interfaces.msg import PatternStack, RigCalibration
+
+from sl_projector.errors import SequenceError, StackError
+from sl_projector.messages import sequence_from_msgs, stamp_from_msg, stamp_to_msg
+from sl_projector.sequence import PatternSequence
+from sl_reconstruct.calibration_file import Calibration, dump_calibration
+from sl_reconstruct.plumb_bob import plumb_bob
+from sl_reconstruct.rig import Device
+
+Array = NDArray[np.float64]
+
+_PIXELS = {"mono8": np.dtype(np.uint8), "mono16": np.dtype("<u2")}
+
+
+@dataclass(frozen=True)
+class Stack:
+    """All images of one scan.
+
+    Parameters
+    ----------
+    scan_id : int
+        The scan.
+    sequence : PatternSequence
+        One pattern per image.
+    images : ndarray, (N, H, W), uint8 or uint16
+        View into the message.
+    stamps_ns : tuple of int
+        Start of each exposure.
+    exposure_s : float
+        Exposure of each pattern, seconds.
+    """
+
+    scan_id: int
+    sequence: PatternSequence
+    images: NDArray[Any]
+    stamps_ns: tuple[int, ...]
+    exposure_s: float
+
+
+def stack_from_msg(message: PatternStack) -> Stack:
+    """Check a stack message and return what is in it, without a copy of its pixels.
+
+    Raises
+    ------
+    StackError
+        When encoding, size, number of images, stamps or patterns do not fit each other.
+    """
+    try:
+        size = (message.dmd_columns, message.dmd_rows)
+        sequence = sequence_from_msgs(message.sequence, size, message.patterns)
+    except SequenceError as error:
+        raise StackError(f"stack of scan {message.scan_id}: {error}") from error
+    stamps_ns = tuple(stamp_from_msg(stamp) for stamp in message.stamps)
+    if len(stamps_ns) != len(sequence):
+        raise StackError(
+            f"stack of scan {message.scan_id} has {len(stamps_ns)} stamps for {len(sequence)} "
+            "patterns; expected one each"
+        )
+    if any(b <= a for a, b in zip(stamps_ns, stamps_ns[1:], strict=False)):
+        raise StackError(f"stack of scan {message.scan_id}: its stamps do not increase")
+    return Stack(
+        message.scan_id, sequence, _images(message, len(sequence)), stamps_ns, message.exposure_s
+    )
+
+
+def _images(message: PatternStack, count: int) -> NDArray[Any]:
+    if message.encoding not in _PIXELS:
+        raise StackError(
+            f"stack of scan {message.scan_id} has the encoding {message.encoding!r}; expected one "
+            f"of {sorted(_PIXELS)}"
+        )
+    dtype = _PIXELS[message.encoding]
+    expected = count * message.height * message.width * dtype.itemsize
+    if expected == 0 or len(message.data) != expected:
+        raise StackError(
+            f"stack of scan {message.scan_id} has {len(message.data)} bytes; expected {count} "
+            f"images of {message.width} x {message.height} {message.encoding} = {expected} (not 0)"
+        )
+    flat = np.frombuffer(message.data, dtype)
+    return flat.reshape(count, message.height, message.width)
+
+
+def cloud_to_msg(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointCloud2:
+    """One organised cloud as a message that shares its memory until it is published.
+
+    Parameters
+    ----------
+    points : ndarray, (rows, columns), structured float32
+        Fields x, y, z, sigma in metres and intensity; NaN where there is no point.
+    stamp_ns : int
+        Start of the scan's first exposure.
+    frame_id : str
+        Frame of x, y, z.
+    """
+    names = points.dtype.names or ()
+    rows, columns = points.shape
+    message = PointCloud2(
+        height=rows,
+        width=columns,
+        fields=[
+            PointField(
+                name=name, offset=points.dtype.fields[name][1], datatype=PointField.FLOAT32, count=1
+            )
+            for name in names
+        ],
+        is_bigendian=False,
+        point_step=points.itemsize,
+        row_step=points.itemsize * columns,
+        is_dense=False,
+    )
+    message.header.stamp = stamp_to_msg(stamp_ns)
+    message.header.frame_id = frame_id
+    message._data = np.ascontiguousarray(points).reshape(-1).view(np.uint8)
+    return message
+
+
+def cloud_from_msg(message: PointCloud2) -> NDArray[Any]:
+    """View of a cloud message as a structured array (rows, columns).
+
+    Raises
+    ------
+    StackError
+        When fields and lengths do not fit each other.
+    """
+    types = {PointField.FLOAT32: "<f4", PointField.FLOAT64: "<f8"}
+    if any(f.datatype not in types for f in message.fields) or message.is_bigendian:
+        raise StackError("cloud message: expected little-endian float fields only")
+    dtype = np.dtype(
+        {
+            "names": [f.name for f in message.fields],
+            "formats": [types[f.datatype] for f in message.fields],
+            "offsets": [f.offset for f in message.fields],
+            "itemsize": message.point_step,
+        }
+    )
+    expected = message.height * message.width * message.point_step
+    if len(message.data) != expected:
+        raise StackError(f"cloud message has {len(message.data)} bytes; expected {expected}")
+    return np.frombuffer(message.data, dtype).reshape(message.height, message.width)
+
+
+def rig_to_msg(
+    calibration: Calibration, source: str, stamp_ns: int, frames: tuple[str, str, str]
+) -> RigCalibration:
+    """Return the calibration in force as a message.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Rig and evidence.
+    source : str
+        Where it was read from.
+    stamp_ns : int
+        When it came in force.
+    frames : tuple of str
+        Frame ids of world, camera and projector.
+    """
+    rig = calibration.rig
+    message = RigCalibration(
+        hash=calibration.hash,
+        source=source,
+        yaml=dump_calibration(calibration),
+        camera=camera_info(rig.camera, frames[1], stamp_ns),
+        projector=camera_info(rig.projector, frames[2], stamp_ns),
+        camera_from_world=pose(rig.camera.rotation, rig.camera.translation_m),
+        projector_from_world=pose(rig.projector.rotation, rig.projector.translation_m),
+    )
+    message.header.stamp = stamp_to_msg(stamp_ns)
+    message.header.frame_id = frames[0]
+    return message
+
+
+def camera_info(device: Device, frame_id: str, stamp_ns: int) -> CameraInfo:
+    """Describe a device to tools that know OpenCV's model; see `plumb_bob` for its error."""
+    lens, _ = plumb_bob(device)
+    width, height = device.image_size
+    matrix = device.camera_matrix
+    info = CameraInfo(
+        height=height,
+        width=width,
+        distortion_model="plumb_bob",
+        d=[float(k) for k in lens.coefficients],
+        k=matrix.ravel().tolist(),
+        r=np.eye(3).ravel().tolist(),
+        p=np.hstack([matrix, np.zeros((3, 1))]).ravel().tolist(),
+    )
+    info.header.frame_id = frame_id
+    info.header.stamp = stamp_to_msg(stamp_ns)
+    return info
+
+
+def pose(rotation: Array, translation_m: Array) -> Pose:
+    """Rotation matrix and translation as a message."""
+    message = Pose()
+    p, q = message.position, message.orientation
+    p.x, p.y, p.z = (float(v) for v in translation_m)
+    q.x, q.y, q.z, q.w = quaternion_xyzw(rotation)
+    return message
+
+
+def quaternion_xyzw(rotation: Array) -> tuple[float, float, float, float]:
+    """Unit quaternion of a rotation matrix, w >= 0; stable for every angle (Shepperd 1978)."""
+    trace = float(np.trace(rotation))
+    diagonal = np.append(np.diag(rotation), trace)
+    i = int(np.argmax(diagonal))
+    q = np.empty(4)
+    if i == 3:
+        q[:3] = [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0],
+                 rotation[1, 0] - rotation[0, 1]]  # fmt: skip
+        q[3] = 1 + trace
+    else:
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[i] = 1 + 2 * rotation[i, i] - trace
+        q[j] = rotation[j, i] + rotation[i, j]
+        q[k] = rotation[k, i] + rotation[i, k]
+        q[3] = rotation[k, j] - rotation[j, k]
+    q *= (1.0 if q[3] >= 0 else -1.0) / np.linalg.norm(q)
+    x, y, z, w = (float(v) for v in q)
+    return x, y, z, w
