@@ -1,0 +1,487 @@
+"""A DLPC900 at the byte level: reports in, reports out, and mirrors that move by the clock.
+
+Written from TI's programmer's guide (DLPU018J) apart from the driver; only the table of DMD
+models is shared. What the guide leaves open is settled leniently, so that foreign host programs
+are understood, except where ``strict`` is said.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_bench.dlpc900_faults import Dlpc900Faults
+from sl_bench.dlpc900_images import ImageFault, decode_image
+from sl_bench.dlpc900_sequencer import Mirrors, OnExposure, Program, Sequencer, Slot
+from sl_projector.clock import Clock, SystemClock
+from sl_projector.dmd import DmdModel, dmd_model
+
+REPORT = 64
+BUFFER = 512
+
+NO_ERROR, INVALID_COMMAND, WRONG_MODE, INVALID_PARAMETER, NOT_PRESENT = 0, 3, 5, 6, 7
+BAD_BIT, BAD_DARK, BAD_DELAY, BAD_EXPOSURE, BAD_INDEX, BAD_DEFINITION = 10, 12, 13, 14, 15, 16
+
+_ERROR_TEXTS = {
+    INVALID_COMMAND: "Invalid command number",
+    WRONG_MODE: "Command not allowed in current mode",
+    INVALID_PARAMETER: "Invalid command parameter",
+    NOT_PRESENT: "Item referred by the parameter is not present",
+    BAD_BIT: "Pattern bit number out of range",
+    BAD_DARK: "Pattern dark time out of range",
+    BAD_DELAY: "Signal delay out of range",
+    BAD_EXPOSURE: "Pattern exposure out of range",
+    BAD_INDEX: "Pattern number out of range",
+    BAD_DEFINITION: "Invalid pattern definition",
+}
+
+# Registers that are only stored: command, bytes at power-up.
+_STORED = {
+    0x1000: bytes(16),
+    0x1008: b"\x00",
+    0x1009: b"\x00",
+    0x1100: bytes(6),
+    0x1A00: b"\x00",
+    0x1A07: b"\x08",
+    0x1A1D: bytes(5),
+    0x1A1E: bytes(5),
+    0x1A35: struct.pack("<HB", 105, 0),
+    0x1A36: b"\x00",
+    0x1A40: b"\x00\x10",
+}
+_MAX_CACHED_PATTERNS = 64
+_MODE_PATTERNS = (1, 2, 3)
+_ON_THE_FLY = 3
+_MAX_FLY_IMAGES = 18
+_LAST_PLANE = 23
+
+
+class Refusal(Exception):
+    """A command that the controller answers with NACK, and its error code."""
+
+    def __init__(self, code: int, reason: str = "") -> None:
+        super().__init__(reason)
+        self.code = code
+        self.reason = reason or _ERROR_TEXTS.get(code, "Device failure")
+
+
+@dataclass
+class _Upload:
+    """An image on its way into the controller."""
+
+    image: int
+    total: int
+    data: bytearray = field(default_factory=bytearray)
+
+
+@dataclass
+class _Controller:
+    """Images in one controller's memory; a DMD has one or two."""
+
+    width: int
+    images: dict[int, NDArray[np.uint32]] = field(default_factory=dict)
+    upload: _Upload | None = None
+
+
+class Dlpc900Emulator:
+    """The controller with its DMD.
+
+    Parameters
+    ----------
+    model : str or DmdModel
+        The DMD.
+    clock : Clock, optional
+        `SystemClock` for real time, `VirtualClock` for tests that do not sleep.
+    on_exposure : callable, optional
+        Called on the sequencer's thread at each trigger edge: mirrors (bool, shape (rows,
+        columns), read-only), number of the exposure in the run, time of the edge (host clock,
+        ns), exposure in seconds. May be set later.
+    camera_output : {2, 1}
+        The trigger output that the camera is wired to: its rising-edge delay applies.
+    strict : bool
+        Forget the images when the pattern table's images or count change, as the guide says
+        (many host programs do without).
+    """
+
+    def __init__(
+        self,
+        model: str | DmdModel = "DLP5500",
+        clock: Clock | None = None,
+        on_exposure: OnExposure | None = None,
+        *,
+        camera_output: int = 2,
+        strict: bool = False,
+    ) -> None:
+        self.model = dmd_model(model) if isinstance(model, str) else model
+        self.faults = Dlpc900Faults()
+        self.strict = strict
+        self._camera_output = camera_output
+        dark = np.zeros((self.model.rows, self.model.columns), np.bool_)
+        dark.flags.writeable = False
+        self._sequencer = Sequencer(clock or SystemClock(), self.faults, dark)
+        self._sequencer.on_exposure = on_exposure
+        self._lock = threading.RLock()
+        self.messages = 0
+        self.errors: list[str] = []
+        self.power_cycle()
+
+    # -- what the bench sees -------------------------------------------------------------------
+
+    @property
+    def on_exposure(self) -> OnExposure | None:
+        """Who is told of trigger edges."""
+        return self._sequencer.on_exposure
+
+    @on_exposure.setter
+    def on_exposure(self, listener: OnExposure | None) -> None:
+        self._sequencer.on_exposure = listener
+
+    @property
+    def running(self) -> bool:
+        """True while a sequence is shown."""
+        return self._sequencer.running
+
+    @property
+    def start_ns(self) -> list[int]:
+        """Start of each exposure of the last run so far, host clock, ns."""
+        return list(self._sequencer.start_ns)
+
+    @property
+    def mode(self) -> int:
+        """Display mode: 3 is pattern on the fly."""
+        return self._mode
+
+    def mirrors_now(self) -> Mirrors:
+        """Return the mirrors as they stand, shape (rows, columns), True is bright."""
+        return self._sequencer.mirrors_now()
+
+    def pattern(self, index: int) -> Mirrors:
+        """Return the mirrors of a pattern table entry as it would be shown."""
+        return self._mirrors_of(self._table[index])
+
+    def trigger_in(self, edge_ns: int | None = None) -> bool:
+        """Raise an edge on TRIG_IN_1; False when no pattern waits for it."""
+        return self._sequencer.trigger_in(edge_ns)
+
+    def power_cycle(self) -> None:
+        """Forget everything, as when power fails."""
+        with self._lock:
+            self._sequencer.halt()
+            self._sequencer.aborted = False
+            self._registers = dict(_STORED)
+            self._power, self._idle, self._mode = 0, 0, 1
+            self._error, self._error_text = NO_ERROR, ""
+            halves = 2 if self.model.dual else 1
+            width = self.model.columns // halves
+            self._controllers = [_Controller(width) for _ in range(halves)]
+            self._definitions: dict[int, Slot] = {}
+            self._table: tuple[Slot, ...] = ()
+            self._exposures = 0
+            self._paused_at = 0
+            self._cache: OrderedDict[tuple[int, int], Mirrors] = OrderedDict()
+            self._pending = bytearray()
+
+    # -- reports -------------------------------------------------------------------------------
+
+    def forget_message(self) -> None:
+        """Drop a message that is incomplete: the bus was reset."""
+        with self._lock:
+            self._pending.clear()
+
+    def receive(self, report: bytes) -> list[bytes]:
+        """Take one report from the host; return the reply's reports, mostly none or one."""
+        with self._lock:
+            self._pending += report.ljust(REPORT, b"\0")
+            (length,) = struct.unpack_from("<H", self._pending, 2)
+            needed = 4 + length
+            if not 2 <= length <= BUFFER - 4:
+                self._pending.clear()
+                self._fail(INVALID_PARAMETER, f"message of {length} bytes")
+                return []
+            if len(self._pending) < needed:
+                return []
+            message = bytes(self._pending[:needed])
+            self._pending.clear()
+            return self._answer(message)
+
+    def _answer(self, message: bytes) -> list[bytes]:
+        flags, sequence, _, command = struct.unpack_from("<BBHH", message)
+        self.messages += 1
+        read = bool(flags & 0x80)
+        data, nack = b"", 0
+        try:
+            data = self._execute(command, message[6:], read)
+        except Refusal as refusal:
+            nack = 0x20
+            self._fail(refusal.code, f"0x{command:04X}: {refusal.reason}")
+        else:
+            if command not in (0x0100, 0x0101):
+                self._error, self._error_text = NO_ERROR, ""
+        if not flags & 0x40:
+            return []
+        reply = struct.pack("<BBH", flags & 0xC7 | nack, sequence, len(data)) + data
+        return [reply[i : i + REPORT].ljust(REPORT, b"\0") for i in range(0, len(reply), REPORT)]
+
+    def _fail(self, code: int, reason: str) -> None:
+        self._error, self._error_text = code, reason
+        self.errors.append(f"error {code}: {reason}")
+
+    def _execute(self, command: int, data: bytes, read: bool) -> bytes:
+        if command not in (0x0100, 0x0101) and self.faults.take("refuse"):
+            raise Refusal(self.faults.refuse_code, "refused on request")
+        if read:
+            return self._read(command)
+        self._write(command, data)
+        return b""
+
+    # -- reading -------------------------------------------------------------------------------
+
+    def _read(self, command: int) -> bytes:
+        if command in self._registers:
+            return self._registers[command]
+        readers: dict[int, Callable[[], bytes]] = {
+            0x0100: lambda: bytes([self._error]),
+            0x0101: lambda: self._error_text.encode()[:127].ljust(128, b"\0"),
+            0x0200: lambda: bytes([self._power]),
+            0x0201: lambda: bytes([self._idle]),
+            0x0205: lambda: struct.pack("<HBB", 0, 1, 6) * 4,
+            0x0206: lambda: bytes([self.model.hardware_code]) + b"EMULATOR".ljust(32, b"\0"),
+            0x1A0A: lambda: bytes([self._hardware_status()]),
+            0x1A0B: lambda: b"\x01",
+            0x1A0C: lambda: bytes([self._main_status()]),
+            0x1A1B: lambda: bytes([self._mode]),
+            0x1A31: lambda: struct.pack("<HI", len(self._table), self._exposures),
+            0x1A42: lambda: struct.pack("<8H", *self.model.min_exposure_us),
+        }
+        if command not in readers:
+            raise Refusal(INVALID_COMMAND)
+        return readers[command]()
+
+    def _hardware_status(self) -> int:
+        return 1 | self.model.dual << 4 | self._sequencer.aborted << 6
+
+    def _main_status(self) -> int:
+        return (self._power == 1) | self.running << 1
+
+    # -- writing -------------------------------------------------------------------------------
+
+    def _write(self, command: int, data: bytes) -> None:
+        writers: dict[int, tuple[int, Callable[[bytes], None]]] = {
+            0x0200: (1, self._set_power),
+            0x0201: (1, self._set_idle),
+            0x0802: (1, lambda _: self.power_cycle()),
+            0x1A1B: (1, self._set_mode),
+            0x1A24: (1, self._start_stop),
+            0x1A2A: (6, lambda d: self._begin_image(0, d)),
+            0x1A2B: (2, lambda d: self._take_chunk(0, d)),
+            0x1A2C: (6, lambda d: self._begin_image(1, d)),
+            0x1A2D: (2, lambda d: self._take_chunk(1, d)),
+            0x1A31: (6, self._configure),
+            0x1A34: (12, self._define),
+        }
+        if command in self._registers:
+            self._store(command, data)
+        elif command not in writers:
+            raise Refusal(INVALID_COMMAND)
+        else:
+            least, writer = writers[command]
+            if len(data) < least:
+                raise Refusal(INVALID_PARAMETER, f"{len(data)} data bytes; expected {least}")
+            writer(data)
+
+    def _store(self, command: int, data: bytes) -> None:
+        size = len(self._registers[command])
+        if len(data) < size:
+            raise Refusal(INVALID_PARAMETER, f"{len(data)} data bytes; expected {size}")
+        if command in (0x1A1D, 0x1A1E):
+            inverted, rising, falling = struct.unpack_from("<Bhh", data)
+            if not (-20 <= rising <= 20000 and -20 <= falling <= 20000):
+                raise Refusal(BAD_DELAY)
+            if inverted & 1 and rising < falling:
+                raise Refusal(BAD_DELAY, "inverted: rising delay below falling delay")
+        if command == 0x1A35 and struct.unpack_from("<H", data)[0] < self.model.block_load_us[-1]:
+            raise Refusal(BAD_DELAY)
+        if 0x1A1D <= command <= 0x1A36:
+            self._refuse_while_running()
+        if command in (0x1008, 0x1009):
+            self._cache.clear()
+        self._registers[command] = data[:size]
+
+    def _refuse_while_running(self) -> None:
+        if self.running:
+            raise Refusal(WRONG_MODE, "a sequence is running")
+
+    def _set_power(self, data: bytes) -> None:
+        if data[0] == 2:
+            self.power_cycle()
+        elif data[0] > 2:
+            raise Refusal(INVALID_PARAMETER)
+        else:
+            self._sequencer.halt()
+            self._power = data[0]
+
+    def _set_idle(self, data: bytes) -> None:
+        if data[0] not in (0, 1, 3):
+            raise Refusal(INVALID_PARAMETER)
+        self._refuse_while_running()
+        self._idle = int(data[0] == 1)
+
+    def _set_mode(self, data: bytes) -> None:
+        if data[0] > _ON_THE_FLY:
+            raise Refusal(INVALID_PARAMETER)
+        self._refuse_while_running()
+        if data[0] != self._mode:
+            self._definitions, self._table, self._paused_at = {}, (), 0
+        self._mode = data[0]
+
+    # -- pattern table -------------------------------------------------------------------------
+
+    def _define(self, data: bytes) -> None:
+        if self._mode not in _MODE_PATTERNS:
+            raise Refusal(WRONG_MODE)
+        self._refuse_while_running()
+        (index,) = struct.unpack_from("<H", data)
+        options = data[5]
+        place = data[10] | data[11] << 8
+        slot = Slot(
+            image=place & 0x7FF,
+            bit=place >> 11,
+            depth=(options >> 1 & 7) + 1 + 8 * (data[9] >> 1 & 1),
+            exposure_us=int.from_bytes(data[2:5], "little"),
+            dark_us=int.from_bytes(data[6:9], "little"),
+            wait_trigger=bool(options & 0x80),
+            trigger_out_2=not data[9] & 1,
+        )
+        self._check_slot(index, slot)
+        self._definitions[index] = slot
+
+    def _check_slot(self, index: int, slot: Slot) -> None:
+        if index >= self.model.max_patterns:
+            raise Refusal(BAD_INDEX)
+        if slot.bit > _LAST_PLANE:
+            raise Refusal(BAD_BIT)
+        if slot.bit + slot.depth > _LAST_PLANE + 1:
+            raise Refusal(BAD_DEFINITION, "bit position and depth leave the image")
+        if slot.exposure_us < self.model.min_exposure_us[min(slot.depth, 8) - 1]:
+            raise Refusal(BAD_EXPOSURE)
+        if 0 < slot.dark_us < self.model.min_dark_us:
+            raise Refusal(BAD_DARK)
+        if self._mode == _ON_THE_FLY and slot.image >= _MAX_FLY_IMAGES:
+            raise Refusal(INVALID_PARAMETER, f"image {slot.image} on the fly")
+
+    def _configure(self, data: bytes) -> None:
+        if self._mode not in _MODE_PATTERNS:
+            raise Refusal(WRONG_MODE)
+        self._refuse_while_running()
+        entries, exposures = struct.unpack_from("<HI", data)
+        entries &= 0x7FF
+        if not 1 <= entries <= self.model.max_patterns:
+            raise Refusal(BAD_INDEX)
+        if missing := [i for i in range(entries) if i not in self._definitions]:
+            raise Refusal(BAD_DEFINITION, f"entry {missing[0]} is not defined")
+        table = tuple(self._definitions[i] for i in range(entries))
+        places = [(s.image, s.bit, s.depth) for s in table]
+        if self.strict and places != [(s.image, s.bit, s.depth) for s in self._table]:
+            self._forget_images()
+        self._table, self._exposures, self._paused_at = table, exposures, 0
+
+    def _forget_images(self) -> None:
+        self._cache.clear()
+        for controller in self._controllers:
+            controller.images.clear()
+
+    # -- images --------------------------------------------------------------------------------
+
+    def _begin_image(self, number: int, data: bytes) -> None:
+        if self._mode != _ON_THE_FLY:
+            raise Refusal(WRONG_MODE)
+        self._refuse_while_running()
+        if number >= len(self._controllers):
+            raise Refusal(INVALID_PARAMETER, "there is no secondary controller")
+        image, total = struct.unpack_from("<HI", data)
+        if image & 0x1F >= _MAX_FLY_IMAGES:
+            raise Refusal(INVALID_PARAMETER, f"image {image} on the fly")
+        controller = self._controllers[number]
+        controller.images.pop(image & 0x1F, None)
+        controller.upload = _Upload(image & 0x1F, total)
+
+    def _take_chunk(self, number: int, data: bytes) -> None:
+        controller = self._controllers[number] if number < len(self._controllers) else None
+        upload = controller.upload if controller else None
+        if controller is None or upload is None:
+            raise Refusal(NOT_PRESENT, "image data without its start")
+        count = struct.unpack_from("<H", data)[0] & 0x3FF
+        if len(data) - 2 < count:
+            raise Refusal(INVALID_PARAMETER, f"chunk of {len(data) - 2} bytes; it says {count}")
+        upload.data += data[2 : 2 + count]
+        if len(upload.data) < upload.total:
+            return
+        controller.upload = None
+        if len(upload.data) > upload.total:
+            raise Refusal(
+                INVALID_PARAMETER, f"{len(upload.data)} bytes of image; announced {upload.total}"
+            )
+        self._cache.clear()
+        try:
+            words = decode_image(bytes(upload.data), controller.width, self.model.rows)
+        except ImageFault as fault:
+            raise Refusal(fault.code, fault.reason) from fault
+        controller.images[upload.image] = words
+
+    def _mirrors_of(self, slot: Slot) -> Mirrors:
+        key = (slot.image, slot.bit)
+        if key not in self._cache:
+            words = np.hstack([c.images[slot.image] for c in self._controllers])
+            # Of more than one bit only the most significant plane is looked at: this bench
+            # shows binary patterns.
+            mirrors = (words >> np.uint32(slot.bit + slot.depth - 1) & 1).astype(np.bool_)
+            mirrors = mirrors[:, ::-1] if self._registers[0x1008][0] & 1 else mirrors
+            mirrors = mirrors[::-1] if self._registers[0x1009][0] & 1 else mirrors
+            mirrors = np.ascontiguousarray(mirrors)
+            mirrors.flags.writeable = False
+            self._cache[key] = mirrors
+            if len(self._cache) > _MAX_CACHED_PATTERNS:
+                self._cache.popitem(last=False)
+        return self._cache[key]
+
+    # -- start and stop ------------------------------------------------------------------------
+
+    def _start_stop(self, data: bytes) -> None:
+        if data[0] == 2:
+            self._start()
+        elif data[0] == 1:
+            self._sequencer.halt()
+            self._paused_at = self._sequencer.exposure
+        elif data[0] == 0:
+            self._sequencer.halt()
+            self._sequencer.aborted = False
+            self._paused_at = 0
+        else:
+            raise Refusal(INVALID_PARAMETER)
+
+    def _start(self) -> None:
+        if self._mode not in _MODE_PATTERNS or self._power or self._idle:
+            raise Refusal(WRONG_MODE)
+        if not self._table:
+            raise Refusal(NOT_PRESENT, "the pattern table is empty")
+        used = {slot.image for slot in self._table}
+        if missing := {i for i in used for c in self._controllers if i not in c.images}:
+            raise Refusal(NOT_PRESENT, f"image {min(missing)} is not loaded")
+        output = self._registers[{1: 0x1A1D, 2: 0x1A1E}[self._camera_output]]
+        self._sequencer.start(
+            Program(
+                slots=self._table,
+                exposures=self._exposures,
+                first=self._paused_at,
+                mirrors_of=self._mirrors_of,
+                edge_delay_us=struct.unpack_from("<h", output, 1)[0],
+                trigger_in_delay_us=struct.unpack("<H", self._registers[0x1A35][:2])[0],
+            )
+        )
+        self._paused_at = 0

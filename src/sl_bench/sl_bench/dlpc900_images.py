@@ -1,0 +1,182 @@
+"""The emulator's decoder of DLPC900 images, written from TI's document alone.
+
+It shares nothing with the driver's encoder. Plain Python over runs: it is fast where an image
+compresses well, which is what a projector is sent.
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+HEADER_BYTES = 48
+SIGNATURE = b"Spld"
+
+
+class ImageFault(Exception):
+    """An image that the controller would not show, with its error code (0x0100)."""
+
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(reason)
+        self.code = code
+        self.reason = reason
+
+
+class _Stream:
+    """Bytes of an image's data, consumed from the front."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self.at = 0
+
+    def byte(self) -> int:
+        """Take one byte."""
+        if self.at >= len(self._data):
+            raise ImageFault(6, f"image data ends after {self.at} bytes without an end mark")
+        self.at += 1
+        return self._data[self.at - 1]
+
+    def take(self, count: int) -> bytes:
+        """Take ``count`` bytes."""
+        part = self._data[self.at : self.at + count]
+        if len(part) < count:
+            raise ImageFault(6, f"image data ends within {count} pixel bytes at {self.at}")
+        self.at += count
+        return part
+
+    def length(self) -> int:
+        """Take an enhanced RLE length: seven bits, or fifteen when bit 7 is set."""
+        low = self.byte()
+        return low if low < 0x80 else (low & 0x7F) | self.byte() << 7
+
+
+class _Canvas:
+    """Pixels in reading order; a line ends by itself when it is full."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.width = width
+        self.pixels = np.zeros((width * height, 3), np.uint8)
+        self.at = 0
+
+    def _room(self, count: int) -> slice:
+        if self.at + count > len(self.pixels) or self.at % self.width + count > self.width:
+            raise ImageFault(6, f"{count} pixels at pixel {self.at} leave the line or the image")
+        self.at += count
+        return slice(self.at - count, self.at)
+
+    def repeat(self, count: int, pixel: bytes) -> None:
+        """Put one colour ``count`` times."""
+        self.pixels[self._room(count)] = np.frombuffer(pixel, np.uint8)
+
+    def literal(self, pixels: bytes) -> None:
+        """Put pixels as they are."""
+        room = self._room(len(pixels) // 3)
+        self.pixels[room] = np.frombuffer(pixels, np.uint8).reshape(-1, 3)
+
+    def copy_above(self, count: int) -> None:
+        """Put ``count`` pixels of the line above."""
+        if self.at < self.width:
+            raise ImageFault(6, "copy from the line above on the first line")
+        room = self._room(count)
+        above = slice(room.start - self.width, room.stop - self.width)
+        self.pixels[room] = self.pixels[above]
+
+    def end_line(self) -> None:
+        """Go to the start of the next line, unless at the start of one."""
+        self.at += -self.at % self.width
+
+
+def _run_length(stream: _Stream, canvas: _Canvas) -> None:
+    while True:
+        count = stream.byte()
+        if count:
+            canvas.repeat(count, stream.take(3))
+            continue
+        count = stream.byte()
+        if count == 0:
+            canvas.end_line()
+            stream.at += -stream.at % 4
+        elif count == 1:
+            return
+        else:
+            canvas.literal(stream.take(3 * count))
+
+
+def _enhanced_run_length(stream: _Stream, canvas: _Canvas) -> None:
+    while True:
+        if stream.byte():
+            stream.at -= 1
+            canvas.repeat(stream.length(), stream.take(3))
+            continue
+        count = stream.length()
+        if count == 0:
+            canvas.end_line()
+        elif count > 1:
+            canvas.literal(stream.take(3 * count))
+        elif (copied := stream.length()) > 0:
+            canvas.copy_above(copied)
+        else:
+            return
+
+
+def _uncompressed(data: bytes, width: int, height: int) -> NDArray[np.uint8]:
+    line = 3 * width
+    padded = (line + 15) // 16 * 16
+    for stride in (padded, line):
+        if len(data) == stride * height:
+            rows = np.frombuffer(data, np.uint8).reshape(height, stride)
+            return rows[:, :line].reshape(-1, 3)
+    raise ImageFault(6, f"{len(data)} bytes of pixels; expected {padded * height}")
+
+
+def decode_image(stream: bytes, width: int, height: int) -> NDArray[np.uint32]:
+    """Decode header and data into 24-bit plane words.
+
+    Parameters
+    ----------
+    stream : bytes
+        The 48-byte header and the encoded pixels. Both ways of counting the bytes in the header
+        (with and without the header itself) are found in the field and accepted, as are both
+        values of bytes 24 and 29.
+    width, height : int
+        What the controller drives; another size is a fault.
+
+    Returns
+    -------
+    ndarray of uint32, shape (height, width)
+        Bit k is plane k.
+
+    Raises
+    ------
+    ImageFault
+        When the controller would refuse or garble it.
+    """
+    if len(stream) < HEADER_BYTES or stream[:4] != SIGNATURE:
+        raise ImageFault(6, f"image begins with {stream[:4]!r}; expected {SIGNATURE!r}")
+    columns, rows, counted = struct.unpack_from("<HHI", stream, 4)
+    if (columns, rows) != (width, height):
+        raise ImageFault(6, f"image of {columns}x{rows}; expected {width}x{height}")
+    data = stream[HEADER_BYTES:]
+    if counted not in (len(data), len(stream)):
+        raise ImageFault(6, f"header counts {counted} bytes; got {len(data)}")
+    pixels = _pixels(stream[25], data, width, height).astype(np.uint32)
+    words = pixels @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    return np.asarray(words, np.uint32).reshape(height, width)
+
+
+def _pixels(compression: int, data: bytes, width: int, height: int) -> NDArray[np.uint8]:
+    if compression == 0:
+        return _uncompressed(data, width, height)
+    canvas, stream = _Canvas(width, height), _Stream(data)
+    if compression == 1:
+        _run_length(stream, canvas)
+    elif compression == 2:
+        _enhanced_run_length(stream, canvas)
+    else:
+        raise ImageFault(9, f"compression {compression}; expected 0, 1 or 2")
+    canvas.end_line()
+    if canvas.at != len(canvas.pixels):
+        raise ImageFault(6, f"image ends after {canvas.at} of {len(canvas.pixels)} pixels")
+    return canvas.pixels

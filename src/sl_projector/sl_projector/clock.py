@@ -1,0 +1,34 @@
+"""The clock that runs are timed by; tests give another one, which does not sleep."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """Tells the time and waits for it."""
+
+    def now_ns(self) -> int:
+        """Time since the epoch, nanoseconds."""
+        ...
+
+    def wait_until(self, deadline_ns: int, interrupt: threading.Event) -> bool:
+        """Wait for a moment; True when ``interrupt`` was set before it."""
+        ...
+
+
+class SystemClock:
+    """The host's clock, `time.time_ns`."""
+
+    def now_ns(self) -> int:
+        """See `Clock`."""
+        return time.time_ns()
+
+    def wait_until(self, deadline_ns: int, interrupt: threading.Event) -> bool:
+        """See `Clock`."""
+        while (left_ns := deadline_ns - time.time_ns()) > 0:
+            if interrupt.wait(left_ns * 1e-9):
+                return True
+        return interrupt.is_set()
