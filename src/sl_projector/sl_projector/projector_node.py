@@ -11,6 +11,7 @@ from typing import Any
 from sensor_msgs.msg import CameraInfo
 from sl_interfaces.msg import PatternTrigger, RigCalibration
 from sl_interfaces.srv import Project
+from std_srvs.srv import Trigger
 
 from sl_projector.base_node import (
     EVENTS,
@@ -33,12 +34,17 @@ from sl_projector.dmd import (
     Timing,
     dmd_model,
 )
-from sl_projector.errors import ConfigError, DeviceLost, DeviceTimeout, SequenceError, SlError
+from sl_projector.errors import (
+    ConfigError,
+    DeviceLost,
+    DeviceRefused,
+    DeviceTimeout,
+    SequenceError,
+    SlError,
+)
 from sl_projector.messages import trigger_to_msg
 from sl_projector.sequence import NAMED, PatternSequence, named
 from sl_projector.sequence_file import load_sequence
-
-MAX_SCAN_ID = 0xFFFFFFFF
 
 
 def find_in_directory(name: str, directory: str, dmd_size: tuple[int, int]) -> PatternSequence:
@@ -87,6 +93,7 @@ class ProjectorNode(RigNode):
         self._make_driver = make_driver or self._make_dlpc900
         self._busy = threading.Lock()
         self._stop = threading.Event()
+        self._halted = threading.Event()
         self._showing = ""
         self._last_id = 0
         self._last_run = time.monotonic()
@@ -97,6 +104,7 @@ class ProjectorNode(RigNode):
         self.create_service(
             Project, "projector/project", self._project, callback_group=self.long_work
         )
+        self.create_service(Trigger, "projector/stop", self._halt, callback_group=self.long_work)
         self._link = DeviceLink("projector", self._connect, self.get_logger().info)
         self._link.start()
         self._poller = threading.Thread(target=self._poll, name="projector status", daemon=True)
@@ -135,6 +143,7 @@ class ProjectorNode(RigNode):
     def close(self) -> None:
         """Stop the mirrors and give the device back."""
         self._stop.set()
+        self._halted.set()
         self._link.close()
         self._poller.join(timeout=5.0)
         super().close()
@@ -202,6 +211,16 @@ class ProjectorNode(RigNode):
             self._busy.release()
         return response
 
+    async def _halt(self, _request: Any, response: Any) -> Any:
+        """End a projection; whoever asked for it gets an error."""
+        self._halted.set()
+        try:
+            await self.in_worker(lambda: self._link.device().stop())
+            response.success, response.message = True, "stopped"
+        except SlError as error:
+            response.message = str(error)
+        return response
+
     def _show(self, request: Any, response: Any) -> None:
         """Load, start, announce each pattern as it is exposed, wait for the end."""
         driver = self._link.device()
@@ -209,6 +228,7 @@ class ProjectorNode(RigNode):
         timing = self._timing(request.exposure_s)
         response.scan_id = self._take_id(request.scan_id)
         self._showing = f"{sequence.name} for scan {response.scan_id}"
+        self._halted.clear()
         try:
             driver.load(sequence, timing)
             info = driver.run(timing)
@@ -245,8 +265,8 @@ class ProjectorNode(RigNode):
         """Publish each trigger when its exposure begins; return how many were."""
         for index in range(len(sequence)):
             start_ns = info.start_ns + round(index * info.timing.period_s * 1e9)
-            if self._stop.wait(max(0.0, (start_ns - time.time_ns()) * 1e-9)):
-                raise DeviceLost("the projector node was stopped during the projection")
+            if self._halted.wait(max(0.0, (start_ns - time.time_ns()) * 1e-9)):
+                raise DeviceRefused("the projection was stopped")
             self._triggers.publish(
                 trigger_to_msg(
                     sequence, index, scan_id, start_ns, info.timing.exposure_s, PROJECTOR_FRAME

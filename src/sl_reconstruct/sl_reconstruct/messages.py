@@ -7,6 +7,7 @@ shares the cloud's memory until it is published (rclpy serialises anything with 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from sl_reconstruct.rig import Device
 
 Array = NDArray[np.float64]
 
-_PIXELS = {"mono8": np.dtype(np.uint8), "mono16": np.dtype("<u2")}
+_PIXELS: dict[str, np.dtype[Any]] = {"mono8": np.dtype(np.uint8), "mono16": np.dtype("<u2")}
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def stack_from_msg(message: PatternStack) -> Stack:
             f"stack of scan {message.scan_id} has {len(stamps_ns)} stamps for {len(sequence)} "
             "patterns; expected one each"
         )
-    if any(b <= a for a, b in zip(stamps_ns, stamps_ns[1:], strict=False)):
+    if any(b <= a for a, b in pairwise(stamps_ns)):
         raise StackError(f"stack of scan {message.scan_id}: its stamps do not increase")
     return Stack(
         message.scan_id, sequence, _images(message, len(sequence)), stamps_ns, message.exposure_s
@@ -91,7 +92,7 @@ def _images(message: PatternStack, count: int) -> NDArray[Any]:
             f"stack of scan {message.scan_id} has {len(message.data)} bytes; expected {count} "
             f"images of {message.width} x {message.height} {message.encoding} = {expected} (not 0)"
         )
-    flat = np.frombuffer(message.data, dtype)
+    flat: NDArray[Any] = np.frombuffer(message.data, dtype)
     return flat.reshape(count, message.height, message.width)
 
 
@@ -107,16 +108,14 @@ def cloud_to_msg(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointClo
     frame_id : str
         Frame of x, y, z.
     """
-    names = points.dtype.names or ()
+    layout = points.dtype.fields or {}
     rows, columns = points.shape
     message = PointCloud2(
         height=rows,
         width=columns,
         fields=[
-            PointField(
-                name=name, offset=points.dtype.fields[name][1], datatype=PointField.FLOAT32, count=1
-            )
-            for name in names
+            PointField(name=name, offset=place[1], datatype=PointField.FLOAT32, count=1)
+            for name, place in layout.items()
         ],
         is_bigendian=False,
         point_step=points.itemsize,
@@ -140,14 +139,16 @@ def cloud_from_msg(message: PointCloud2) -> NDArray[Any]:
     types = {PointField.FLOAT32: "<f4", PointField.FLOAT64: "<f8"}
     if any(f.datatype not in types for f in message.fields) or message.is_bigendian:
         raise StackError("cloud message: expected little-endian float fields only")
-    dtype = np.dtype(
-        {
-            "names": [f.name for f in message.fields],
-            "formats": [types[f.datatype] for f in message.fields],
-            "offsets": [f.offset for f in message.fields],
-            "itemsize": message.point_step,
-        }
-    )
+    layout: Any = {
+        "names": [f.name for f in message.fields],
+        "formats": [types[f.datatype] for f in message.fields],
+        "offsets": [f.offset for f in message.fields],
+        "itemsize": message.point_step,
+    }
+    try:
+        dtype: np.dtype[Any] = np.dtype(layout)
+    except ValueError as error:
+        raise StackError(f"cloud message: its fields do not fit a point: {error}") from error
     expected = message.height * message.width * message.point_step
     if len(message.data) != expected:
         raise StackError(f"cloud message has {len(message.data)} bytes; expected {expected}")
