@@ -25,6 +25,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
+from scipy.spatial.transform import Rotation
 
 from sl_bringup.bags import (
     CALIBRATION,
@@ -39,7 +40,8 @@ from sl_bringup.bags import (
 from sl_projector.errors import BagError
 from sl_projector.sequence import PatternSequence
 from sl_reconstruct.calibration_file import Calibration, dump_calibration
-from sl_reconstruct.rig import BrownConrady, Device
+from sl_reconstruct.plumb_bob import plumb_bob
+from sl_reconstruct.rig import Device
 
 Storage = Literal["mcap", "sqlite3"]
 
@@ -172,22 +174,19 @@ def _pose(position_m: Any, quaternion: Any) -> Any:
 
 
 def _quaternion(device: Device) -> Any:
-    from scipy.spatial.transform import Rotation
-
     return Rotation.from_matrix(device.rotation).as_quat()
 
 
 def _camera_info(device: Device, frame_id: str, stamp_ns: int) -> Any:
-    """CameraInfo; OpenCV has no name for the division model, so that one stays empty."""
-    lens = device.lens
-    brown = isinstance(lens, BrownConrady)
+    """CameraInfo, with the nearest lens that OpenCV has a name for."""
+    lens, _ = plumb_bob(device)
     k = device.camera_matrix
     return message_class("sensor_msgs/msg/CameraInfo")(
         header=header(stamp_ns, frame_id),
         width=device.image_size[0],
         height=device.image_size[1],
-        distortion_model="plumb_bob" if brown else "",
-        d=np.array(lens.coefficients if isinstance(lens, BrownConrady) else []),
+        distortion_model="plumb_bob",
+        d=np.array(lens.coefficients),
         k=k.reshape(-1),
         r=np.eye(3).reshape(-1),
         p=np.hstack([k, np.zeros((3, 1))]).reshape(-1),

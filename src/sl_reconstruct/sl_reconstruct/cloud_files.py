@@ -78,11 +78,11 @@ def save_pcd(
     int
         Number of points written, those that are NaN included.
     """
-    kept = points if organised else present(points)[np.newaxis, :]
-    packed = np.empty(kept.shape, dtype=[(name, "<f4") for name in POINT_FIELDS])
+    kept = points if organised else present(points)
+    height, width = points.shape if organised else (1, len(kept))
+    packed = np.empty(kept.size, dtype=[(name, "<f4") for name in POINT_FIELDS])
     for name in POINT_FIELDS:
-        packed[name] = kept[name]
-    height, width = packed.shape
+        packed[name] = kept[name].reshape(-1)
     lines = [
         "# .PCD v0.7 - Point Cloud Data file format",
         *(f"# {line}" for line in ("lengths in metres", *_lines(notes))),

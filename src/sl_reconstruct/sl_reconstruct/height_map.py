@@ -103,7 +103,7 @@ def make_height_map(points: NDArray[Any], step_m: float | None = None) -> Height
     return HeightMap(z, float(x0), float(y0), float(step))
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, nogil=True)
 def _rasterise(
     u: NDArray[np.float64],
     v: NDArray[np.float64],
@@ -120,7 +120,7 @@ def _rasterise(
             _triangle(u, v, z, out, limit_m, step_m, (r + 1, c + 1), (r + 1, c), (r, c + 1))
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, nogil=True)
 def _triangle(
     u: NDArray[np.float64],
     v: NDArray[np.float64],
