@@ -111,8 +111,8 @@ class StackMatcher:
 
     @property
     def busy(self) -> bool:
-        """Tell whether a scan waits for its verdict."""
-        return bool(self._open)
+        """Tell whether `tick` is needed: a scan waits for its verdict, an image for its trigger."""
+        return bool(self._open or self._waiting)
 
     # -- triggers ---------------------------------------------------------------------------
 
