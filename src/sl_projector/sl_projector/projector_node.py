@@ -122,8 +122,8 @@ class ProjectorNode(RigNode):
         self._directory = self.declare(
             "sequence_dir", "", "directory whose sequence files may be asked for by name"
         )
-        self.declare("exposure_s", 0.010, "exposure of each pattern, s", 1e-5, 16.0, live=True)
-        self.declare("dark_s", 0.010, "dark time after each exposure, s", 0.0, 16.0, live=True)
+        self.declare("exposure_s", 0.034, "exposure of each pattern, s", 1e-5, 16.0, live=True)
+        self.declare("dark_s", 0.0, "dark time after each exposure, s", 0.0, 16.0, live=True)
         self._idle_after_s = self.declare(
             "idle_after_s", 300.0, "without a scan for so long the mirrors are spared, s", 1.0, 1e6
         )

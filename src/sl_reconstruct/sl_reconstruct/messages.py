@@ -108,7 +108,7 @@ def cloud_to_msg(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointClo
     frame_id : str
         Frame of x, y, z.
     """
-    layout = points.dtype.fields or {}
+    layout: dict[str, Any] = dict(points.dtype.fields or {})
     rows, columns = points.shape
     message = PointCloud2(
         height=rows,
