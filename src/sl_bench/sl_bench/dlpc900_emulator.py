@@ -85,7 +85,7 @@ class _Controller:
     """Images in one controller's memory; a DMD has one or two."""
 
     width: int
-    images: dict[int, NDArray[np.uint32]] = field(default_factory=dict)
+    images: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
     upload: _Upload | None = None
 
 
@@ -429,18 +429,19 @@ class Dlpc900Emulator:
             )
         self._cache.clear()
         try:
-            words = decode_image(bytes(upload.data), controller.width, self.model.rows)
+            planes = decode_image(bytes(upload.data), controller.width, self.model.rows)
         except ImageFault as fault:
             raise Refusal(fault.code, fault.reason) from fault
-        controller.images[upload.image] = words
+        controller.images[upload.image] = planes
 
     def _mirrors_of(self, slot: Slot) -> Mirrors:
         key = (slot.image, slot.bit)
         if key not in self._cache:
-            words = np.hstack([c.images[slot.image] for c in self._controllers])
             # Of more than one bit only the most significant plane is looked at: this bench
             # shows binary patterns.
-            mirrors = (words >> np.uint32(slot.bit + slot.depth - 1) & 1).astype(np.bool_)
+            plane = slot.bit + slot.depth - 1
+            planes = np.hstack([c.images[slot.image][plane // 8] for c in self._controllers])
+            mirrors = (planes & np.uint8(1 << plane % 8)) != 0
             mirrors = mirrors[:, ::-1] if self._registers[0x1008][0] & 1 else mirrors
             mirrors = mirrors[::-1] if self._registers[0x1009][0] & 1 else mirrors
             mirrors = np.ascontiguousarray(mirrors)

@@ -131,8 +131,8 @@ def _uncompressed(data: bytes, width: int, height: int) -> NDArray[np.uint8]:
     raise ImageFault(6, f"{len(data)} bytes of pixels; expected {padded * height}")
 
 
-def decode_image(stream: bytes, width: int, height: int) -> NDArray[np.uint32]:
-    """Decode header and data into 24-bit plane words.
+def decode_image(stream: bytes, width: int, height: int) -> NDArray[np.uint8]:
+    """Decode header and data into bit planes.
 
     Parameters
     ----------
@@ -145,8 +145,8 @@ def decode_image(stream: bytes, width: int, height: int) -> NDArray[np.uint32]:
 
     Returns
     -------
-    ndarray of uint32, shape (height, width)
-        Bit k is plane k.
+    ndarray of uint8, shape (3, height, width)
+        Plane k is bit ``k % 8`` of element ``k // 8``.
 
     Raises
     ------
@@ -161,9 +161,9 @@ def decode_image(stream: bytes, width: int, height: int) -> NDArray[np.uint32]:
     data = stream[HEADER_BYTES:]
     if counted not in (len(data), len(stream)):
         raise ImageFault(6, f"header counts {counted} bytes; got {len(data)}")
-    pixels = _pixels(stream[25], data, width, height).astype(np.uint32)
-    words = pixels @ np.array([1 << 16, 1 << 8, 1], np.uint32)
-    return np.asarray(words, np.uint32).reshape(height, width)
+    pixels = _pixels(stream[25], data, width, height)
+    # On the wire planes 16-23 come first.
+    return np.ascontiguousarray(pixels[:, ::-1].T).reshape(3, height, width)
 
 
 def _pixels(compression: int, data: bytes, width: int, height: int) -> NDArray[np.uint8]:

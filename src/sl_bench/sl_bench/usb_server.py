@@ -130,8 +130,19 @@ class EmulatedUsb:
     def transfer_out(self, link: EmulatedLink, report: bytes) -> None:
         """Carry a report to the device and queue what it answers."""
         self._check_transfer(link)
-        for reply in self.device.receive(report):
+        replies = self.device.receive(report)
+        if replies:
+            self._overwrite()
+        for reply in replies:
             self._queue(reply)
+
+    def _overwrite(self) -> None:
+        """Drop what the host did not read: the controller has one buffer for answers."""
+        now_s = time.monotonic()
+        with self._ready:
+            late = [entry for entry in self._replies if entry[0] > now_s]
+            self._replies.clear()
+            self._replies.extend(late)
 
     def _check_transfer(self, link: EmulatedLink) -> None:
         if self._owner is not link:

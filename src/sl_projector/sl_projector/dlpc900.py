@@ -15,7 +15,7 @@ from typing import Any
 
 from sl_projector import dlpc900_protocol as protocol
 from sl_projector.clock import Clock, SystemClock
-from sl_projector.dlpc900_codec import encode_patterns, map_planes
+from sl_projector.dlpc900_codec import encode_patterns, map_planes, warm_up
 from sl_projector.dlpc900_port import REPLY_TIMEOUT_S, Dlpc900Port
 from sl_projector.dmd import (
     DEFAULT_MODEL,
@@ -146,6 +146,7 @@ class Dlpc900:
 
     def open(self) -> None:
         """See `ProjectorDriver`."""
+        warm_up()
         with self._lock:
             self._release()
             transport = open_usb(
@@ -343,6 +344,8 @@ class Dlpc900:
         port.write(protocol.START_STOP, bytes([protocol.STOP]))
         self._leave_idle_if_set(port)
         port.write(protocol.DISPLAY_MODE, bytes([protocol.MODE_ON_THE_FLY]))
+        # Others report errors without another stop after a change of mode.
+        port.write(protocol.START_STOP, bytes([protocol.STOP]))
 
     def _leave_idle_if_set(self, port: Dlpc900Port) -> None:
         if self._idle:

@@ -288,3 +288,8 @@ def encode_patterns(patterns: Sequence[Pattern], model: DmdModel) -> tuple[bytes
     words = pack_planes([p.frame(model.size) for p in patterns])
     halves = np.hsplit(words, 2) if model.dual else [words]
     return tuple(encode_image(np.ascontiguousarray(half)) for half in halves)
+
+
+def warm_up() -> None:
+    """Compile the encoders (once per installation) or load them, before they are needed."""
+    encode_image(pack_planes([np.zeros((8, 8), np.uint8)]))

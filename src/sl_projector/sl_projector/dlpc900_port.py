@@ -43,7 +43,7 @@ class Dlpc900Port:
 
     def drain(self) -> None:
         """Throw away replies to an earlier owner's commands."""
-        with self._lock, contextlib.suppress(DeviceTimeout, DeviceRefused):
+        with self._lock, contextlib.suppress(DeviceTimeout):
             for _ in range(_MAX_DRAINED):
                 self._transport.read(_DRAIN_TIMEOUT_S)
 
@@ -119,11 +119,11 @@ class Dlpc900Port:
     def _twice(self, exchange: Callable[[], protocol.Reply]) -> protocol.Reply:
         try:
             return exchange()
-        except (DeviceTimeout, DeviceRefused):  # a stall counts as refused by the transport
+        except DeviceTimeout:
             return exchange()
 
     def _send(self, command: int, data: bytes, *, read: bool, reply: bool) -> int:
-        self._sequence = (self._sequence + 1) & 0xFF
+        self._sequence = self._sequence % 255 + 1  # never 0: padding would look like an answer
         packet = protocol.message(command, data, read=read, reply=reply, sequence=self._sequence)
         began_ns = time.time_ns()
         for report in protocol.reports(packet):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+from collections.abc import Callable
 from typing import Any, NoReturn, Protocol
 
 import usb.core
@@ -17,7 +18,6 @@ from sl_projector.errors import (
     ConfigError,
     DeviceError,
     DeviceLost,
-    DeviceRefused,
     DeviceTimeout,
 )
 from sl_projector.usb_socket import ENDPOINT_IN, ENDPOINT_OUT, LinkBackend, SocketLink
@@ -30,7 +30,7 @@ class HidTransport(Protocol):
     """Reports of 64 bytes each way; the driver is its only user."""
 
     def write(self, report: bytes, timeout_s: float) -> None:
-        """Send one report. Raises DeviceTimeout, DeviceRefused on a stall, DeviceLost."""
+        """Send one report. Raises DeviceTimeout, DeviceLost, DeviceError."""
         ...
 
     def read(self, timeout_s: float) -> bytes:
@@ -47,7 +47,9 @@ def _translate(error: usb.core.USBError, doing: str) -> NoReturn:
     if isinstance(error, usb.core.USBTimeoutError) or error.errno == errno.ETIMEDOUT:
         raise DeviceTimeout(f"USB {doing}: no answer in time") from error
     if error.errno == errno.EPIPE:
-        raise DeviceRefused(f"USB {doing}: the endpoint stalled") from error
+        raise DeviceLost(
+            f"USB {doing}: the endpoint stalled again; open the device anew"
+        ) from error
     if error.errno == errno.EBUSY:
         raise DeviceLost(
             f"USB {doing}: another program or kernel driver has the device; close it first"
@@ -84,26 +86,31 @@ class UsbHid:
 
     def write(self, report: bytes, timeout_s: float) -> None:
         """See `HidTransport`."""
-        try:
-            self._device.write(ENDPOINT_OUT, report, max(1, round(timeout_s * 1000)))
-        except usb.core.USBError as error:
-            self._recover(error, ENDPOINT_OUT)
-            _translate(error, "write")
+        timeout_ms = max(1, round(timeout_s * 1000))
+        self._transfer(lambda: self._device.write(ENDPOINT_OUT, report, timeout_ms), ENDPOINT_OUT)
 
     def read(self, timeout_s: float) -> bytes:
         """See `HidTransport`."""
-        try:
-            timeout_ms = max(1, round(timeout_s * 1000))
-            return bytes(self._device.read(ENDPOINT_IN, REPORT_BYTES, timeout_ms))
-        except usb.core.USBError as error:
-            self._recover(error, ENDPOINT_IN)
-            _translate(error, "read")
+        timeout_ms = max(1, round(timeout_s * 1000))
+        return bytes(
+            self._transfer(
+                lambda: self._device.read(ENDPOINT_IN, REPORT_BYTES, timeout_ms), ENDPOINT_IN
+            )
+        )
 
-    def _recover(self, error: usb.core.USBError, endpoint: int) -> None:
-        """End a stall, so that the next transfer has a chance."""
-        if error.errno == errno.EPIPE:
-            with contextlib.suppress(usb.core.USBError, NotImplementedError):
-                self._device.clear_halt(endpoint)
+    def _transfer(self, transfer: Callable[[], Any], endpoint: int) -> Any:
+        """Do a transfer; one that stalled carried nothing, so it is done again, once."""
+        doing = "write" if endpoint == ENDPOINT_OUT else "read"
+        try:
+            return transfer()
+        except usb.core.USBError as error:
+            if error.errno != errno.EPIPE:
+                _translate(error, doing)
+        try:
+            self._device.clear_halt(endpoint)
+            return transfer()
+        except usb.core.USBError as error:
+            _translate(error, doing)
 
     def close(self) -> None:
         """See `HidTransport`."""
