@@ -222,7 +222,9 @@ def machine_frame(
     travel = tuple(abs(settings.get(130 + i, 0.0)) for i in range(len(AXES)))
     homing = int(settings.get(22, 0)) & 1
     top = tuple(0.0 if homing else length for length in travel)
-    middle = tuple((high - length) / 2 if homing else 0.0 for high, length in zip(top, travel))
+    middle = tuple(
+        (high - length) / 2 if homing else 0.0 for high, length in zip(top, travel, strict=True)
+    )
     return MachineFrame(
         origin_mm or (middle[0], middle[1], middle[2]),
         signs,
