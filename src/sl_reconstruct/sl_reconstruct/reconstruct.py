@@ -1,0 +1,245 @@
+"""From a stack of images to a cloud: the one entry of the reconstruction."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_projector.errors import StackError
+from sl_projector.sequence import PatternSequence
+from sl_reconstruct.cloud import CLOUD_DTYPE, Cloud, Figures, count_reasons
+from sl_reconstruct.edges import SQRT_2PI, Filter, Tuning
+from sl_reconstruct.filters import bar_slope, edge_filter, gaussian_taps, tap_variance
+from sl_reconstruct.geometry import geometry
+from sl_reconstruct.plan import AxisPlan, DecodePlan
+from sl_reconstruct.points import Output, triangulate_rows
+from sl_reconstruct.rig import Rig
+from sl_reconstruct.rows import Layout, Lines, decode_rows
+from sl_reconstruct.settings import Settings
+from sl_reconstruct.workers import share_rows
+from sl_reconstruct.survey import Noise, code_growth, fit_noise, sample_scatter, survey_rows
+
+#: Blur assumed until it is measured, camera pixels.
+FIRST_BLUR_PX = 1.0
+#: An edge's blur does not matter beyond so many standard deviations.
+REACH_SD = 2.5
+#: A usable BR8 needs this slope at a stripe's centre, per pixel of a unit stripe.
+MIN_BAR_SLOPE = 0.05
+
+
+class AxisState(NamedTuple):
+    """What one axis of one stack is decoded with."""
+
+    tuning: Tuning
+    edge_filter: Filter
+    bar_slope: float
+    blur_px: float
+    noise: Noise
+
+
+class Reconstructor:
+    """Reconstructs stacks of one sequence, seen by one rig.
+
+    Parameters
+    ----------
+    rig : Rig
+        Camera and projector.
+    sequence : PatternSequence
+        What was projected; images of a stack come in its order.
+    settings : Settings
+        Choices of the user.
+
+    Notes
+    -----
+    Scratch memory is kept between calls; calls from several threads wait for each other.
+    Results do not depend on the number of threads.
+    """
+
+    def __init__(
+        self, rig: Rig, sequence: PatternSequence, settings: Settings | None = None
+    ) -> None:
+        self.rig = rig
+        self.sequence = sequence
+        self.settings = settings or Settings()
+        self.plan = DecodePlan.of(sequence)
+        if sequence.dmd_size != rig.projector.image_size:
+            raise StackError(
+                f"sequence {sequence.name!r} is made for a DMD of {sequence.dmd_size} pixels but "
+                f"the rig's projector has {rig.projector.image_size}"
+            )
+        self._geometry = geometry(rig)
+        self._lock = threading.Lock()
+        self._scratch: dict[tuple[Any, ...], Lines] = {}
+
+    def __call__(self, stack: NDArray[np.uint8] | NDArray[np.uint16]) -> Cloud:
+        """Reconstruct one stack.
+
+        Parameters
+        ----------
+        stack : ndarray, (N, H, W) of uint8 or uint16
+            Images in pattern order, DN.
+
+        Returns
+        -------
+        Cloud
+            All NaN, with reasons, where nothing can be measured.
+
+        Raises
+        ------
+        StackError
+            When number, shape or type of the images do not fit sequence and rig, or the images
+            contradict the sequence (exchanged, repeated or foreign frames).
+        """
+        self._check(stack)
+        with self._lock:
+            return self._reconstruct(np.ascontiguousarray(stack))
+
+    def _check(self, stack: NDArray[Any]) -> None:
+        width, height = self.rig.camera.image_size
+        expected = (self.plan.count, height, width)
+        if not isinstance(stack, np.ndarray) or stack.dtype not in (np.uint8, np.uint16):
+            found = getattr(stack, "dtype", type(stack).__name__)
+            raise StackError(f"stack of {found}; expected an array of uint8 or uint16")
+        if stack.shape != expected:
+            raise StackError(
+                f"stack.shape={stack.shape}; expected {expected}: {self.plan.count} images of "
+                f"sequence {self.sequence.name!r} from the rig's {width}x{height} camera"
+            )
+
+    def _reconstruct(self, stack: NDArray[Any]) -> Cloud:
+        state, lines, figures = self._decode(stack, self.plan.column)
+        height, boundaries = lines.u_px.shape
+        points = np.empty((height, boundaries), CLOUD_DTYPE)
+        out = Output(
+            points.view(np.float32).reshape(height, boundaries, 5),
+            np.empty((height, boundaries), np.float32),
+            np.empty((height, boundaries), np.uint8),
+        )
+        columns = np.arange(boundaries) - 0.5
+        limit = self.settings.max_jump_px
+        share_rows(
+            lambda a, b: triangulate_rows(a, b, self._geometry, columns, lines, limit, out), height
+        )
+        refused, lit = count_reasons(out.reason)
+        return Cloud(points, out.u_px, out.reason, refused, lit, figures)
+
+    def _decode(self, stack: NDArray[Any], plan: AxisPlan) -> tuple[AxisState, Lines, Figures]:
+        layout = make_layout(plan, self.plan.white, self.plan.black, stack)
+        ys = survey_rows(stack.shape[1])
+        few = self._lines((ys.size, plan, "survey"))
+        state = survey(stack, ys, plan, layout, self.settings, few)
+        lines = self._lines((stack.shape[1], plan, "all"))
+        rows = np.arange(stack.shape[1])
+        arguments = (stack, layout, state.edge_filter, state.tuning, state.bar_slope, lines)
+        share_rows(lambda a, b: decode_rows(rows, a, b, *arguments), rows.size)
+        return state, lines, figures_of(state, lines, ys)
+
+    def _lines(self, key: tuple[Any, ...]) -> Lines:
+        """Scratch for so many rows of an axis, made once."""
+        if key not in self._scratch:
+            rows, plan = key[0], key[1]
+            shape = (rows, plan.size_px)
+            self._scratch[key] = Lines(
+                *(np.full(shape, np.nan, np.float32) for _ in range(4)),
+                np.ones(shape, np.uint8), np.zeros((rows, len(plan.sources), 2), np.int32),
+            )  # fmt: skip
+        return self._scratch[key]
+
+
+def make_layout(plan: AxisPlan, white: int, black: int, stack: NDArray[Any]) -> Layout:
+    """Write an axis's plan as arrays for the kernels."""
+    k = np.arange(plan.size_px)
+    edge_owner = np.full(plan.size_px, -1)
+    centre_owner = np.full(plan.size_px, -1)
+    for i, s in enumerate(plan.sources):
+        if s.edges:
+            edge_owner[s.edge_at(k) & (edge_owner < 0) & (k > 0)] = i
+    for i, s in enumerate(plan.sources):
+        if s.centres:
+            at = s.centre_at(k, plan.size_px) & (edge_owner < 0) & (centre_owner < 0)
+            centre_owner[at & (k > 0)] = i
+    sources = [
+        (s.image, s.inverse, s.half_period_px, s.rising_px, s.edges, s.centres)
+        for s in plan.sources
+    ]
+    bits = [(b.image, b.inverse, b.flipped) for b in plan.bits]
+    sums = np.zeros(1, np.uint16 if stack.dtype == np.uint8 else np.uint32)
+    return Layout(
+        np.array(sources, np.int64), edge_owner, centre_owner, np.array(bits, np.int64),
+        np.array(plan.images, np.int64), white, black, plan.dynamic, sums,
+    )  # fmt: skip
+
+
+def first_tuning(plan: AxisPlan, settings: Settings, full_scale: int) -> Tuning:
+    """What is known before a look at the images."""
+    contrast_dn = settings.min_contrast_dn or 0.03 * full_scale
+    return Tuning(
+        1, int(np.ceil(REACH_SD * FIRST_BLUR_PX)), 1.0, plan.division_px, plan.size_px,
+        0.002 * full_scale, 0.5 * contrast_dn, contrast_dn,
+        settings.saturation_dn or full_scale, 0.0, np.inf, settings.min_light, 0.0, 0.0,
+    )  # fmt: skip
+
+
+def survey(
+    stack: NDArray[Any], ys: NDArray[np.int64], plan: AxisPlan, layout: Layout,
+    settings: Settings, few: Lines,
+) -> AxisState:  # fmt: skip
+    """Measure direction, scale, noise and blur on a few rows, and choose the filters."""
+    tuning = first_tuning(plan, settings, int(np.iinfo(stack.dtype).max))
+    growth, _ = code_growth(stack, ys, layout, tuning)
+    if not abs(growth) > 0:
+        growth = 1.0
+    noise = fit_noise(sample_scatter(stack, ys, layout, tuning))
+    tuning = tuning._replace(
+        direction=1 if growth > 0 else -1, scale=1 / abs(growth),
+        noise_dn2=noise.read_dn2, noise_dn=noise.shot_dn,
+    )  # fmt: skip
+    first = edge_filter(plan, True, FIRST_BLUR_PX, tuning.scale)
+    decode_rows(ys, 0, ys.size, stack, layout, first, tuning, 0.0, few)
+    tuning = tuning._replace(scale=measure_scale(few, tuning.scale))
+    blur_px = settings.edge_blur_px or measure_blur(few, plan, layout, tuning.scale)
+    tuning = tuning._replace(
+        reach_px=max(2, int(np.ceil(REACH_SD * blur_px))),
+        min_slope=settings.min_slope, max_slope=settings.max_slope,
+    )  # fmt: skip
+    matched = settings.estimator == "matched"
+    bars = 0.0 if matched else bar_slope(2 * plan.sources[0].half_period_px * tuning.scale, blur_px)
+    return AxisState(
+        tuning, edge_filter(plan, matched, blur_px, tuning.scale),
+        bars if bars > MIN_BAR_SLOPE else 0.0, blur_px, noise,
+    )  # fmt: skip
+
+
+def measure_scale(lines: Lines, guess: float) -> float:
+    """Camera pixels per DMD pixel: median distance of boundaries that are 8 apart."""
+    steps = np.abs(lines.u_px[:, 8:] - lines.u_px[:, :-8]) / 8
+    steps = steps[np.isfinite(steps)]
+    return float(np.median(steps)) if steps.size else guess
+
+
+def measure_blur(lines: Lines, plan: AxisPlan, layout: Layout, scale: float) -> float:
+    """Blur of the edges: median over those whose neighbours do not flatten them, pixels."""
+    taps = gaussian_taps(FIRST_BLUR_PX, int(np.ceil(3 * FIRST_BLUR_PX)))
+    seen_px = np.hypot(FIRST_BLUR_PX, np.sqrt(tap_variance(taps)))
+    wide = [i for i, s in enumerate(plan.sources) if 2 * s.half_period_px * scale > 6 * seen_px]
+    width = lines.width_px[:, np.isin(layout.edge_owner, wide)]
+    good = width[(lines.reason[:, np.isin(layout.edge_owner, wide)] == 0)]
+    if good.size == 0:
+        return FIRST_BLUR_PX
+    variance = (float(np.median(good)) * seen_px) ** 2 - tap_variance(taps)
+    return float(np.sqrt(np.clip(variance, 0.3**2, 4.0**2)))
+
+
+def figures_of(state: AxisState, lines: Lines, ys: NDArray[np.int64]) -> Figures:
+    """Quality figures from the surveyed rows."""
+    t = state.tuning
+    present = lines.reason[ys] == 0
+    sigma = lines.sigma_px[ys][present]
+    return Figures(
+        edge_blur_px=state.blur_px, scale_px=t.scale * t.direction,
+        noise_read_dn2=state.noise.read_dn2, noise_shot_dn=state.noise.shot_dn,
+        edge_sigma_px=float(np.median(sigma)) if sigma.size else float("nan"),
+    )  # fmt: skip
