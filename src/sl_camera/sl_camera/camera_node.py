@@ -73,7 +73,7 @@ class CameraNode(RigNode):
             self.subscribe(PatternTrigger, "projector/trigger", self._on_trigger, EVENTS)
         self.create_service(Trigger, "camera/trigger", self._trigger)
         self.add_on_set_parameters_callback(self._on_parameters)
-        self._link = DeviceLink("camera", self._connect, self.get_logger().info)
+        self._link = DeviceLink("camera", self._connect, self.say)
         self._link.start()
         self._reader = threading.Thread(target=self._read, name="camera frames", daemon=True)
         self._reader.start()

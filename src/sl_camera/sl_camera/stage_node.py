@@ -49,7 +49,7 @@ class StageNode(RigNode):
         self._serve(Trigger, "stage/home", self._home)
         self._serve(Trigger, "stage/stop", self._halt)
         self._serve(Trigger, "stage/clear", self._clear)
-        self._link = DeviceLink("stage", self._connect, self.get_logger().info)
+        self._link = DeviceLink("stage", self._connect, self.say)
         self._link.start()
         self._poller = threading.Thread(target=self._poll, name="stage pose", daemon=True)
         self._poller.start()

@@ -170,6 +170,11 @@ class RigNode(Node):  # type: ignore[misc]  # rclpy carries no types
         )
         return self.create_subscription(kind, topic, guarded, qos, event_callbacks=events)
 
+    def say(self, text: str) -> None:
+        """Log a line, also from a thread that outlives the context by a moment."""
+        if self.context.ok():
+            self.get_logger().info(text)
+
     def complain(self, topic: str, error: Exception) -> None:
         """Count and log something that was refused."""
         self.counts[f"{topic} refused"] += 1

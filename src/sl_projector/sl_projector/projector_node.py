@@ -105,7 +105,7 @@ class ProjectorNode(RigNode):
             Project, "projector/project", self._project, callback_group=self.long_work
         )
         self.create_service(Trigger, "projector/stop", self._halt, callback_group=self.long_work)
-        self._link = DeviceLink("projector", self._connect, self.get_logger().info)
+        self._link = DeviceLink("projector", self._connect, self.say)
         self._link.start()
         self._poller = threading.Thread(target=self._poll, name="projector status", daemon=True)
         self._poller.start()

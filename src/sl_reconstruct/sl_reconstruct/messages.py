@@ -6,22 +6,25 @@ shares the cloud's memory until it is published (rclpy serialises anything with 
 
 from __future__ import annotations
 
+import hashlib
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Pose
+from geometry_msgs.msg import Pose, Quaternion, TransformStamped, Vector3
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
-from sl_interfaces.msg import PatternStack, RigCalibration
+from sl_interfaces.msg import PatternStack, RefusalCount, RigCalibration, ScanReport
 
 from sl_projector.errors import SequenceError, StackError
 from sl_projector.messages import sequence_from_msgs, stamp_from_msg, stamp_to_msg
 from sl_projector.sequence import PatternSequence
 from sl_reconstruct.calibration_file import Calibration, dump_calibration
 from sl_reconstruct.plumb_bob import plumb_bob
-from sl_reconstruct.rig import Device
+from sl_reconstruct.rig import Device, Rig
+from sl_reconstruct.workshop import Product
 
 Array = NDArray[np.float64]
 
@@ -128,6 +131,36 @@ def cloud_to_msg(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointClo
     return message
 
 
+def report_to_msg(product: Product, stack: Stack) -> ScanReport:
+    """Say what a stack gave: counts, figures and hashes (times and attempts are the node's)."""
+    cloud = product.cloud
+    rows, columns = cloud.points.shape
+    sigma = cloud.points["sigma"]
+    sigma = sigma[np.isfinite(sigma)]
+    return ScanReport(
+        scan_id=stack.scan_id,
+        sequence=stack.sequence.name,
+        attempts=1,
+        rows=rows,
+        columns=columns,
+        points=cloud.present,
+        lit_positions=cloud.lit,
+        refused=[RefusalCount(reason=r, count=n) for r, n in sorted(cloud.refused.items())],
+        median_sigma_m=float(np.median(sigma)) if sigma.size else math.nan,
+        edge_sigma_px=cloud.figures.edge_sigma_px,
+        edge_bound_px=cloud.figures.edge_bound_px,
+        edge_blur_px=cloud.figures.edge_blur_px,
+        calibration_hash=product.calibration_hash,
+        settings_hash=product.settings_hash,
+        cloud_hash=cloud_hash(cloud.points),
+    )
+
+
+def cloud_hash(points: NDArray[Any]) -> str:
+    """Hexadecimal SHA-256 of a cloud's points as they are in a message."""
+    return hashlib.sha256(np.ascontiguousarray(points).data.cast("B")).hexdigest()
+
+
 def cloud_from_msg(message: PointCloud2) -> NDArray[Any]:
     """View of a cloud message as a structured array (rows, columns).
 
@@ -212,6 +245,20 @@ def pose(rotation: Array, translation_m: Array) -> Pose:
     p.x, p.y, p.z = (float(v) for v in translation_m)
     q.x, q.y, q.z, q.w = quaternion_xyzw(rotation)
     return message
+
+
+def frames_of(rig: Rig, frames: tuple[str, str, str]) -> list[TransformStamped]:
+    """Where camera and projector stand in the world, for tf: parent is the world."""
+    transforms = []
+    for device, name in ((rig.camera, frames[1]), (rig.projector, frames[2])):
+        transform = TransformStamped(child_frame_id=name)
+        transform.header.frame_id = frames[0]
+        x, y, z = (float(v) for v in device.position_m)
+        transform.transform.translation = Vector3(x=x, y=y, z=z)
+        qx, qy, qz, qw = quaternion_xyzw(device.rotation.T)
+        transform.transform.rotation = Quaternion(x=qx, y=qy, z=qz, w=qw)
+        transforms.append(transform)
+    return transforms
 
 
 def quaternion_xyzw(rotation: Array) -> tuple[float, float, float, float]:

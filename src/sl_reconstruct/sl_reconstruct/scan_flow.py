@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from sl_projector.errors import SlError
+from sl_projector.errors import SlError, StackError
 
 POLL_S = 0.05
 
@@ -285,8 +285,10 @@ class ScanRun:
             watch, "reconstruct", lambda: watch.result is not None, self._timeouts.reconstruct_s,
             "the reconstruction did not end in time",
         )  # fmt: skip
-        if isinstance(watch.result, Exception):
+        if isinstance(watch.result, StackError):
             raise ScanSpoilt(f"scan {watch.scan_id}: {watch.result}") from watch.result
+        if isinstance(watch.result, Exception):
+            raise ScanFailed(f"scan {watch.scan_id}: {watch.result}") from watch.result
         self._report("publish", watch)
         return watch.result
 

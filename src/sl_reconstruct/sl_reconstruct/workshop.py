@@ -1,0 +1,111 @@
+"""The calibration in force, the settings, and a reconstructor for every sequence that comes."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_projector.errors import CalibrationError
+from sl_projector.sequence import Pattern, PatternSequence, named
+from sl_reconstruct.calibration_file import Calibration
+from sl_reconstruct.cloud import Cloud
+from sl_reconstruct.reconstruct import Reconstructor
+from sl_reconstruct.rig import Device, Division, Rig
+from sl_reconstruct.settings import Settings
+
+#: Sequences whose scratch memory is kept.
+MAX_SEQUENCES = 2
+_TINY_CAMERA, _TINY_DMD = (64, 16), (32, 24)
+
+
+class Product(NamedTuple):
+    """A cloud and what it was made with."""
+
+    cloud: Cloud
+    calibration_hash: str
+    settings_hash: str
+
+
+class Workshop:
+    """Makes clouds of stacks; calibration and stacks may come from different threads.
+
+    Parameters
+    ----------
+    settings : Settings
+        How a stack becomes a cloud.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.settings_hash = settings.hash()
+        self._lock = threading.Lock()
+        self._calibration: Calibration | None = None
+        self._hash = ""
+        self._made: OrderedDict[tuple[object, ...], Reconstructor] = OrderedDict()
+
+    @property
+    def calibration_hash(self) -> str:
+        """Hash of the calibration in force; empty when there is none."""
+        return self._hash
+
+    def calibrate(self, calibration: Calibration) -> None:
+        """Put a calibration in force, from the next stack on."""
+        with self._lock:
+            self._calibration, self._hash = calibration, calibration.hash
+            self._made.clear()
+
+    def __call__(
+        self, images: NDArray[np.uint8] | NDArray[np.uint16], sequence: PatternSequence
+    ) -> Product:
+        """Make a cloud.
+
+        Parameters
+        ----------
+        images : ndarray, (N, H, W), uint8 or uint16
+            In pattern order.
+        sequence : PatternSequence
+            What was projected.
+
+        Raises
+        ------
+        CalibrationError
+            When no calibration is in force.
+        StackError
+            When the images fit neither the sequence nor the calibration.
+        """
+        with self._lock:
+            reconstructor, used = self._reconstructor(sequence), self._hash
+        return Product(reconstructor(images), used, self.settings_hash)
+
+    def _reconstructor(self, sequence: PatternSequence) -> Reconstructor:
+        if self._calibration is None:
+            raise CalibrationError("no calibration is in force; expected one before a stack")
+        key: tuple[tuple[int, int], tuple[Pattern, ...]] = (sequence.dmd_size, sequence.patterns)
+        if key not in self._made:
+            self._made[key] = Reconstructor(self._calibration.rig, sequence, self.settings)
+        self._made.move_to_end(key)
+        while len(self._made) > MAX_SEQUENCES:
+            self._made.popitem(last=False)
+        return self._made[key]
+
+    def warm_up(self) -> None:
+        """Compile, or load from the cache, what the first stack would wait for."""
+        for dtype in (np.uint8, np.uint16):
+            sequence = named("precise", _TINY_DMD)
+            stack = np.zeros((len(sequence), *_TINY_CAMERA[::-1]), dtype)
+            Reconstructor(tiny_rig(), sequence, self.settings)(stack)
+
+
+def tiny_rig() -> Rig:
+    """Return a rig of few pixels, two devices side by side above the world's plane."""
+
+    def device(size: tuple[int, int], x_m: float) -> Device:
+        centre: Any = ((size[0] - 1) / 2, (size[1] - 1) / 2)
+        down = np.diag([1.0, -1.0, -1.0])
+        return Device(size, (400.0, 400.0), centre, 1e-5, down, np.array([x_m, 0, 0.1]), Division())
+
+    return Rig(device(_TINY_CAMERA, 0.02), device(_TINY_DMD, -0.02))
