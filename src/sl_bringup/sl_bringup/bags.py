@@ -135,11 +135,14 @@ class Bag:
         Namespace of the rig in it.
     lost : list of str
         What could not be read, in words; grows while messages are read.
+    notes : list of str
+        What is odd about it but costs nothing.
     """
 
     path: Path
     namespace: str
     lost: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     _storages: list[tuple[str, _Storage]] = field(default_factory=list)
 
     def messages(self, *topics: Topic) -> Iterator[Recorded]:
@@ -238,12 +241,13 @@ def _open_storages(bag: Bag) -> None:
         _refuse_formats(exc, bag.path)
         no_metadata = isinstance(exc, FileNotFoundError)
         why = "no metadata.yaml, read file by file" if no_metadata else _reason(exc)
-        bag.lost.append(f"{bag.path.name}: {why}")
+        (bag.notes if no_metadata else bag.lost).append(f"{bag.path.name}: {why}")
         for file in _files(bag.path):
             _open_file(bag, file)
         if not bag._storages:
+            told = "; ".join([*bag.notes, *bag.lost])
             raise BagError(
-                f"{bag.path} cannot be read: {'; '.join(bag.lost)}; expected a rosbag2 directory "
+                f"{bag.path} cannot be read: {told}; expected a rosbag2 directory "
                 "or an .mcap or .db3 file"
             ) from None
 

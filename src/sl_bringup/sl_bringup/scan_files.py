@@ -1,0 +1,138 @@
+"""The files of one scan: cloud, height map, pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sl_bringup import pictures
+from sl_projector.documents import written_atomically
+from sl_projector.errors import StackError
+from sl_reconstruct.cloud import Cloud
+from sl_reconstruct.cloud_files import save_pcd, save_ply
+from sl_reconstruct.height_map import HeightMap, make_height_map, save_png, save_tiff
+from sl_reconstruct.plane_fit import Plane, fit_plane
+from sl_reconstruct.reasons import REFUSALS
+
+#: Points that a plane is fitted to; more change nothing.
+PLANE_POINTS = 500_000
+FILES = ("cloud.ply", "cloud.pcd", "height.tiff", "height.png", "report.json", "report.html")
+PICTURES = ("picture_height", "picture_relief", "picture_residual", "picture_profile",
+            "picture_refusals")  # fmt: skip
+
+
+def write_scan(
+    folder: Path, report: dict[str, Any], cloud: Cloud | None, with_pictures: bool
+) -> dict[str, bytes]:
+    """Write a scan's cloud, height map and pictures; files of an earlier evaluation go first.
+
+    Parameters
+    ----------
+    folder : Path
+        The scan's folder.
+    report : dict
+        Gets what is found here: height map, best plane, notes.
+    cloud : Cloud or None
+        None where the scan was refused.
+    with_pictures : bool
+        Whether pictures are drawn.
+
+    Returns
+    -------
+    dict
+        PNG pictures by caption.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in [*FILES, *(f"{picture}.png" for picture in PICTURES)]:
+        (folder / name).unlink(missing_ok=True)
+    if cloud is None:
+        return {}
+    notes = {key: report[key] for key in ("calibration_hash", "settings_hash", "cloud_hash")}
+    save_ply(folder / "cloud.ply", cloud.points, notes)
+    save_pcd(folder / "cloud.pcd", cloud.points, notes)
+    plane = _best_plane(cloud, report)
+    height = _height_map(folder, cloud, report)
+    if not with_pictures:
+        return {}
+    drawn = _draw(cloud, height, plane, f"{report['bag']}, scan {report['scan_id']}")
+    for name, (_, png) in drawn.items():
+        with written_atomically(folder / f"{name}.png") as partial:
+            partial.write_bytes(png)
+    return dict(drawn.values())
+
+
+def _best_plane(cloud: Cloud, report: dict[str, Any]) -> Plane | None:
+    xyz = cloud.xyz_m[np.isfinite(cloud.points["z"])]
+    plane = fit_plane(xyz[:: max(1, len(xyz) // PLANE_POINTS)].astype(np.float64))
+    if plane is not None:
+        report["plane"] = {
+            "rms_m": plane.rms_m,
+            "normal": plane.normal,
+            "point_m": plane.point_m,
+            "tilt_deg": float(np.degrees(np.arccos(min(1.0, plane.normal[2])))),
+            "points": plane.used,
+            "set_aside": plane.set_aside,
+        }
+    return plane
+
+
+def _height_map(folder: Path, cloud: Cloud, report: dict[str, Any]) -> HeightMap | None:
+    """Write the height map; a cloud that has none gets a note."""
+    try:
+        height = make_height_map(cloud.points)
+    except StackError as exc:
+        report.setdefault("notes", []).append(f"no height map: {exc}")
+        return None
+    save_tiff(folder / "height.tiff", height)
+    low_m, high_m = save_png(folder / "height.png", height)
+    report["height_map"] = {
+        "x0_m": height.x0_m,
+        "y0_m": height.y0_m,
+        "step_m": height.step_m,
+        "rows": height.z_m.shape[0],
+        "columns": height.z_m.shape[1],
+        "png_value_1_m": low_m,
+        "png_value_65535_m": high_m,
+        "note": "first row has the largest y; TIFF in metres, NaN where nothing was measured",
+    }
+    return height
+
+
+def _draw(
+    cloud: Cloud, height: HeightMap | None, plane: Plane | None, title: str
+) -> dict[str, tuple[str, bytes]]:
+    """Pictures by file name, each with its caption."""
+    drawn = {}
+    if height is not None:
+        drawn["picture_height"] = "Height map", pictures.height_picture(height, title)
+        drawn["picture_relief"] = "Shaded relief", pictures.relief_picture(height, title)
+    if height is not None and plane is not None:
+        told = f"{title}\ndeviation from the best plane"
+        picture = pictures.residual_picture(height, _deviation_m(height, plane), told)
+        drawn["picture_residual"] = "Deviation from the best plane", picture
+    if cloud.present:
+        drawn["picture_profile"] = "Section", pictures.profile_picture(cloud.points, title)
+    drawn["picture_refusals"] = (
+        "Why points are missing",
+        pictures.refusal_picture(
+            cloud.reason, tuple(REFUSALS.values()), _counts(cloud),
+            f"{title}\nwhy points are missing",
+        ),
+    )  # fmt: skip
+    return drawn
+
+
+def _counts(cloud: Cloud) -> dict[str, int]:
+    return {
+        "points": cloud.present, "not lit": cloud.reason.size - cloud.lit, **cloud.refused,
+    }  # fmt: skip
+
+
+def _deviation_m(height: HeightMap, plane: Plane) -> Any:
+    rows, columns = height.z_m.shape
+    x = height.x0_m + np.arange(columns) * height.step_m
+    y = height.y0_m - np.arange(rows) * height.step_m
+    xyz = np.stack(np.broadcast_arrays(x[None, :], y[:, None], height.z_m), axis=-1)
+    return plane.distances_m(xyz)
