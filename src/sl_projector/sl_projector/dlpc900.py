@@ -456,7 +456,8 @@ class Dlpc900:
 
     def _check_duration(self, run: RunInfo, ended_ns: int) -> None:
         lasted_s = (ended_ns - run.start_ns) * 1e-9
-        least_s = run.duration_s * (1 - _EARLY_RELATIVE) - _EARLY_S
+        margin_s = _EARLY_S + run.start_uncertainty_ns * 1e-9
+        least_s = run.duration_s * (1 - _EARLY_RELATIVE) - margin_s
         if self._settings.trigger_in is None and lasted_s < least_s:
             raise DeviceError(
                 f"the run ended after {lasted_s:.3f} s; expected {run.duration_s:.3f} s"

@@ -292,14 +292,17 @@ class ReconstructNode(RigNode):
             self._read_calibration()
         if not self._workshop.calibration_hash:
             raise CalibrationError(f"no calibration is in force: {self._calibration_fault}")
+        began_s = time.perf_counter()
         product = self._workshop(stack.images, stack.sequence)
+        computed_s = time.perf_counter() - began_s
         self._clouds.publish(cloud_to_msg(product.cloud.points, stack.stamps_ns[0], WORLD_FRAME))
         done_ns = time.time_ns()
         report = report_to_msg(product, stack)
         report.processing_s = (done_ns - came_ns) * 1e-9
         report.acquisition_s = max(0.0, (came_ns - stack.stamps_ns[0]) * 1e-9)
         self.get_logger().info(
-            f"scan {stack.scan_id}: {report.points} points in {report.processing_s:.3f} s"
+            f"scan {stack.scan_id}: {report.points} points {report.processing_s:.3f} s after the "
+            f"last image, {computed_s:.3f} s of it reconstruction"
         )
         return report
 
@@ -397,7 +400,7 @@ class ReconstructNode(RigNode):
 
         def answered(future: Any) -> None:
             reply = future.result()
-            watch.answered(reply.success, reply.message)
+            watch.answered(reply.success, reply.count, reply.message)
 
         try:
             self._project.call_async(request).add_done_callback(answered)

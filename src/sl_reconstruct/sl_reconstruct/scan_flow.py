@@ -90,7 +90,7 @@ class ScanWatch:
         self.verdict: str | None = None
         self.reason = ""
         self.last_image_ns = 0
-        self.projected: tuple[bool, str] | None = None
+        self.projected: tuple[bool, int, str] | None = None
         self.stack_came = False
         self.result: Any = None
         self._sign_s = time.monotonic()
@@ -107,10 +107,10 @@ class ScanWatch:
         with self._told():
             self.verdict, self.reason = ("complete" if complete else "refused"), reason
 
-    def answered(self, success: bool, message: str) -> None:
-        """The projector is done, or cannot."""
+    def answered(self, success: bool, shown: int, message: str) -> None:
+        """The projector is done with so many patterns, or cannot."""
         with self._told():
-            self.projected = (success, message)
+            self.projected = (success, shown, message)
 
     def arrived(self) -> None:
         """The stack is here and will be worked on."""
@@ -262,7 +262,9 @@ class ScanRun:
             watch, "project", lambda: watch.projected is not None, self._timeouts.project_s,
             "the projector did not answer: is the projector node running?",
         )  # fmt: skip
-        success, message = watch.projected or (False, "")
+        success, shown, message = watch.projected or (False, 0, "")
+        if not success and shown:
+            raise ScanSpoilt(f"the projector faltered in scan {watch.scan_id}: {message}")
         if not success:
             raise ScanFailed(f"the projector did not show the sequence: {message}")
 
