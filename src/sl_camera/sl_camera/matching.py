@@ -154,6 +154,8 @@ class StackMatcher:
         scan = ScanRecord(event, self.settings, self._allocate)
         for other in list(self._open):
             self._check_apart(other, scan)
+            if event.scan_id == other.first.scan_id:
+                yield from self._close(other)
         while len(self._open) >= MAX_OPEN:
             oldest = self._open[0]
             oldest.blame(f"{MAX_OPEN} more scans began before it was complete")
@@ -219,17 +221,16 @@ class StackMatcher:
         )
 
     def _foreign(self, waiting: _Waiting) -> FrameDecision:
-        """Decide that no trigger explains an image; it spoils the scan in which it came."""
-        reason = "no trigger explains this image"
-        for scan in self._open:
-            if scan.covers(waiting.event.stamp_ns) or 0 <= scan.first_arrival < waiting.arrival:
-                scan.blame("an image came in between that no trigger explains")
-                return scan.decide(
-                    Status.IMAGE_WITHOUT_TRIGGER, 0, reason, 0, waiting.event.stamp_ns
-                )
-        return FrameDecision(
-            Status.IMAGE_WITHOUT_TRIGGER, reason=reason, image_stamp_ns=waiting.event.stamp_ns
+        """Decide that no trigger explains an image; it spoils every scan in which it came."""
+        reason, stamp_ns = "no trigger explains this image", waiting.event.stamp_ns
+        decision = FrameDecision(
+            Status.IMAGE_WITHOUT_TRIGGER, reason=reason, image_stamp_ns=stamp_ns
         )
+        for scan in self._open:
+            if scan.covers(stamp_ns) or 0 <= scan.first_arrival < waiting.arrival:
+                scan.blame("an image came in between that no trigger explains")
+                decision = scan.decide(decision.status, 0, reason, 0, stamp_ns)
+        return decision
 
     def _spoil(self, scan: ScanRecord) -> Iterator[FrameDecision]:
         """Blame a scan for unexplained images that came among its own, or right behind them."""

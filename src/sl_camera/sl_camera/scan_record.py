@@ -33,6 +33,7 @@ class ScanRecord:
     """What is known of one scan between its first trigger and its verdict.
 
     It never forgets a problem: `problems` empty at the verdict is the only way to a stack.
+    ``start_ns`` and ``last_ns`` are the first and last starts of exposures known.
 
     Parameters
     ----------
@@ -58,6 +59,8 @@ class ScanRecord:
         self.progress_ns = 0
         self._settings = settings
         self._allocate = allocate
+        self.start_ns = self.last_ns = first.stamp_ns
+        self._period_ns = 0
         self._next_trigger = 0
         self._next_image = 0
 
@@ -71,6 +74,7 @@ class ScanRecord:
         elif not fault:
             fault = self._order_fault(event)
             self.triggers[event.index] = event
+            self._update_times()
             self._next_trigger = max(self._next_trigger, event.index + 1)
             self.progress_ns = now_ns
         if not fault:
@@ -83,7 +87,7 @@ class ScanRecord:
     def _trigger_fault(self, event: TriggerEvent) -> str:
         """Why this trigger cannot be one of the scan's; such a scan is given up at once."""
         first = self.first
-        fault = _plausible(event, self._settings) or _as_named(event)
+        fault = _plausible(event, self._settings)
         found = (event.sequence_name, event.dmd_size, event.count, event.exposure_s)
         expected = (first.sequence_name, first.dmd_size, first.count, first.exposure_s)
         if not fault and found != expected:
@@ -91,6 +95,7 @@ class ScanRecord:
                 f"trigger {self.of(event.index)} says sequence, DMD size, count, exposure = "
                 f"{found}, the scan began with {expected}"
             )
+        fault = fault or _as_named(event)
         self.hopeless = self.hopeless or bool(fault)
         return fault
 
@@ -115,15 +120,19 @@ class ScanRecord:
 
     # -- time -------------------------------------------------------------------------------
 
+    def _update_times(self) -> None:
+        """Work out once per trigger what is asked for with every image."""
+        known = sorted(self.triggers)
+        stamps_ns = [self.triggers[index].stamp_ns for index in known]
+        self.start_ns, self.last_ns = min(stamps_ns), max(stamps_ns)
+        if self.count == 1:
+            self._period_ns = int(self.first.exposure_s * 1e9)
+        elif len(known) > 1:
+            self._period_ns = max(0, (stamps_ns[1] - stamps_ns[0]) // (known[1] - known[0]))
+
     def period_ns(self) -> int:
         """Distance of the first two triggers; 0 as long as it is unknown."""
-        known = sorted(self.triggers)[:2]
-        if self.count == 1 and known:
-            return int(self.first.exposure_s * 1e9)
-        if len(known) < 2:
-            return 0
-        a, b = (self.triggers[i] for i in known)
-        return max(0, (b.stamp_ns - a.stamp_ns) // (b.index - a.index))
+        return self._period_ns
 
     def gate_ns(self) -> int:
         """Half width of the window around a trigger in which its image lies."""
@@ -131,11 +140,12 @@ class ScanRecord:
 
     def index_of(self, stamp_ns: int) -> int | None:
         """Trigger that an image of this stamp belongs to, None when (so far) there is none."""
-        if not self.period_ns():
-            return None
         shifted = stamp_ns - int(self._settings.clock_offset_s * 1e9)
+        gate_ns = self.gate_ns()
+        if not gate_ns or not self.start_ns - gate_ns <= shifted <= self.last_ns + gate_ns:
+            return None
         near = min(self.triggers.values(), key=lambda t: abs(t.stamp_ns - shifted))
-        return near.index if abs(near.stamp_ns - shifted) <= self.gate_ns() else None
+        return near.index if abs(near.stamp_ns - shifted) <= gate_ns else None
 
     def covers(self, stamp_ns: int) -> bool:
         """Tell whether a stamp lies between the triggers known so far."""
@@ -148,19 +158,9 @@ class ScanRecord:
         return 0 < shifted - self.last_ns <= self.period_ns() + self.gate_ns()
 
     @property
-    def start_ns(self) -> int:
-        """Start of the first exposure known."""
-        return min(t.stamp_ns for t in self.triggers.values())
-
-    @property
-    def last_ns(self) -> int:
-        """Start of the last exposure known."""
-        return max(t.stamp_ns for t in self.triggers.values())
-
-    @property
     def newest_ns(self) -> int:
         """Latest trigger stamp known, that of the first trigger included where it was refused."""
-        return max([self.first.stamp_ns, *(t.stamp_ns for t in self.triggers.values())])
+        return max(self.first.stamp_ns, self.last_ns)
 
     @property
     def end_ns(self) -> int:
