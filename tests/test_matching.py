@@ -606,8 +606,11 @@ def spoil(script: Script, rng: random.Random, rate: float) -> bool:
 
 
 def as_it_comes(script: Script) -> list[list[int]]:
-    """Which objects of each kind come in which order; what is later than the time-out never."""
-    last_ns = script.start_ns + N * PERIOD + 1000 * MS
+    """Which objects of each kind come in which order, but for what is later than the last of all.
+
+    That is missed, or (the second one of a duplicate) harmless, for the stack is out by then.
+    """
+    last_ns = script.start_ns + N * PERIOD + 100 * MS
     kinds = (script.triggers, script.images, script.poses)
     ordered = [sorted(kind, key=lambda e: e[0]) for kind in kinds]
     return [[id(e) for at, e in kind if at < last_ns] for kind in ordered]
