@@ -1,0 +1,90 @@
+"""Asks the graph whether it is ready: nodes there, content with themselves, services offered."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+
+from sl_bringup.progress import complain, say
+
+SERVICES = ("projector/project", "stage/move", "stage/home", "scan", "scan/_action/send_goal")
+#: What is missing is said when it has been so for the first wait, and again after the second.
+PATIENCE_S, REPEAT_S = 5.0, 20.0
+
+
+class ReadyNode(Node):  # type: ignore[misc]  # rclpy carries no types
+    """Watches `/diagnostics` and the graph.
+
+    Parameters
+    ----------
+    namespace : str
+        Of the rig.
+    nodes : sequence of str
+        Nodes that must be there.
+    """
+
+    def __init__(self, namespace: str, nodes: Sequence[str]) -> None:
+        super().__init__("ready", namespace=namespace)
+        self._nodes = nodes
+        self._said: dict[str, tuple[bytes, str]] = {}
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._listen, 50)
+
+    def _listen(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self._said[status.name.partition(":")[0]] = (status.level, status.message)
+
+    def missing(self) -> list[str]:
+        """Say what is not ready, in words; warnings are not errors but worth a wait."""
+        found = [fault for name in self._nodes if (fault := self._fault(name))]
+        offered = {name for name, _ in self.get_service_names_and_types()}
+        prefix = self.get_namespace().rstrip("/")
+        return found + [f"no service {s}" for s in SERVICES if f"{prefix}/{s}" not in offered]
+
+    def _fault(self, name: str) -> str:
+        if name not in self._said:
+            return f"{name} is silent"
+        level, message = self._said[name]
+        return "" if level == DiagnosticStatus.OK else f"{name}: {message}"
+
+
+def wait(node: ReadyNode, timeout_s: float) -> bool:
+    """Spin until nothing is missing; what is, is said again and again."""
+    began_s = time.monotonic()
+    next_s = began_s + PATIENCE_S
+    while missing := node.missing():
+        rclpy.spin_once(node, timeout_sec=0.1)
+        now_s = time.monotonic()
+        if timeout_s and now_s - began_s > timeout_s:
+            complain(f"graph not ready: {'; '.join(missing)}")
+            return False
+        if now_s > next_s:
+            next_s = now_s + REPEAT_S
+            say(f"waiting: {'; '.join(missing)}")
+    return True
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Exit status 0 when the graph is ready in time."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--namespace", default="/sl")
+    parser.add_argument("--nodes", nargs="+", required=True)
+    parser.add_argument("--timeout", type=float, default=0.0, help="seconds; 0: wait for ever")
+    options = parser.parse_args(args)
+    try:
+        rclpy.init(args=[])
+        node = ReadyNode(options.namespace, options.nodes)
+        return 0 if wait(node, options.timeout) else 1
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 130
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
