@@ -40,7 +40,7 @@ EXTERNAL_TRIGGER_MARGIN_US = (
 )
 _POLL_S = 0.05
 _END_POLL_S = 0.002
-_WAIT_MARGIN_S = 1.0
+_WAIT_MARGIN_S = 3.0
 # How much sooner than computed a run may end: host and device clocks, and the start's latency.
 _EARLY_S, _EARLY_RELATIVE = 0.005, 1e-3
 _IDLE_OFF_VALUES = (0, 3)  # older and newer firmware
@@ -152,7 +152,7 @@ class Dlpc900:
             transport = open_usb(
                 self._device, protocol.VENDOR_ID, protocol.PRODUCT_ID, self._backend
             )
-            self._port = Dlpc900Port(transport, self._settings.reply_timeout_s)
+            self._port = Dlpc900Port(transport, self._settings.reply_timeout_s, self._clock)
             try:
                 self._prepare(self._port)
             except DeviceError:
@@ -382,7 +382,8 @@ class Dlpc900:
                 port.write(protocol.IMAGE_INIT[controller], init)
                 for chunk in protocol.image_chunks(stream):
                     port.send(protocol.IMAGE_DATA[controller], chunk)
-                port.check(f"loading image {number} to controller {controller}")
+                    # Asked each time: the next command without an error would hide this one's.
+                    port.check(f"loading image {number} to controller {controller}")
 
     # -- running -------------------------------------------------------------------------------
 
@@ -398,7 +399,7 @@ class Dlpc900:
             self._check_ready(port)
             self._program(port, loaded, timing, repeats)
             self._stopped.clear()
-            began_ns, ended_ns = port.write_once(protocol.START_STOP, bytes([protocol.START]))
+            began_ns, ended_ns = self._start(port)
             self._run = RunInfo(
                 start_ns=(began_ns + ended_ns) // 2,
                 start_uncertainty_ns=(ended_ns - began_ns) // 2,
@@ -406,6 +407,13 @@ class Dlpc900:
                 timing=timing,
             )
             return self._run
+
+    def _start(self, port: Dlpc900Port) -> tuple[int, int]:
+        try:
+            return port.write_once(protocol.START_STOP, bytes([protocol.START]))
+        except DeviceError:
+            self._loaded = None  # what the device holds is not to be trusted: load it anew
+            raise
 
     def _check_ready(self, port: Dlpc900Port) -> None:
         mode = port.read(protocol.DISPLAY_MODE)[0]
@@ -433,6 +441,7 @@ class Dlpc900:
             self._check_hardware(port, "the run")
         except DeviceError:
             self.stop()
+            self._loaded = None
             raise
         self._check_duration(run, ended_ns)
 

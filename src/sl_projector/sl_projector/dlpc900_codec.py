@@ -72,14 +72,14 @@ def _copy_length(line, above, column, longest):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _literal_length(line, above, column, longest, has_above):  # type: ignore[no-untyped-def]
-    # A literal run goes on until a repeat or copy of three pixels: a shorter one saves nothing
+    # A literal run ends at a repeat or copy of two pixels or more: a single one saves nothing
     # once the next literal run's own count bytes are paid.
     end = min(line.size, column + longest)
     stop = column + 1
     while stop < end:
-        if _repeat_length(line, stop, 3) == 3:
+        if _repeat_length(line, stop, 2) == 2:
             break
-        if has_above and _copy_length(line, above, stop, 3) == 3:
+        if has_above and _copy_length(line, above, stop, 2) == 2:
             break
         stop += 1
     return stop - column

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 
 from sl_projector import dlpc900_protocol as protocol
+from sl_projector.clock import Clock, SystemClock
 from sl_projector.errors import DeviceError, DeviceRefused, DeviceTimeout
 from sl_projector.transport import HidTransport
 
@@ -29,11 +30,19 @@ class Dlpc900Port:
         Reports to and from the device; closed by `close`.
     reply_timeout_s : float
         How long to wait for the reply to a command.
+    clock : Clock
+        What `write_once` tells the time by.
     """
 
-    def __init__(self, transport: HidTransport, reply_timeout_s: float = REPLY_TIMEOUT_S) -> None:
+    def __init__(
+        self,
+        transport: HidTransport,
+        reply_timeout_s: float = REPLY_TIMEOUT_S,
+        clock: Clock | None = None,
+    ) -> None:
         self._transport = transport
         self._reply_timeout_s = reply_timeout_s
+        self._clock: Clock = clock or SystemClock()
         self._lock = threading.RLock()
         self._sequence = 0
         self.messages = 0
@@ -88,7 +97,7 @@ class Dlpc900Port:
         Returns
         -------
         began_ns, ended_ns : int
-            `time.time_ns` around the outgoing transfer. Raises as `read`.
+            The clock around the outgoing transfer. Raises as `read`.
         """
         with self._lock:
             reply = self._exchange(command, data, read=False)
@@ -125,11 +134,11 @@ class Dlpc900Port:
     def _send(self, command: int, data: bytes, *, read: bool, reply: bool) -> int:
         self._sequence = self._sequence % 255 + 1  # never 0: padding would look like an answer
         packet = protocol.message(command, data, read=read, reply=reply, sequence=self._sequence)
-        began_ns = time.time_ns()
+        began_ns = self._clock.now_ns()
         for report in protocol.reports(packet):
             self._transport.write(report, self._reply_timeout_s)
             self.reports_out += 1
-        self._sent_ns = (began_ns, time.time_ns())
+        self._sent_ns = (began_ns, self._clock.now_ns())
         self.messages += 1
         return self._sequence
 

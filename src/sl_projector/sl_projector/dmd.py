@@ -280,7 +280,7 @@ class ProjectorDriver(Protocol):
         """Block until the run is over, then read the error and status registers.
 
         Called after `run` with ``repeats`` > 0. ``timeout_s`` is counted from the start; None
-        means the run's duration and a second.
+        means the run's duration and a few seconds.
 
         Raises
         ------
