@@ -10,20 +10,26 @@ import functools
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from sl_bringup.mended_mcap import MendedPath
 from sl_projector.errors import BagError
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:  # what rosbags itself depends on
+    from backports import zstd
 
 
 @dataclass(frozen=True)
@@ -123,6 +129,20 @@ class _Storage(Protocol):
     ) -> Iterator[tuple[Connection, int, bytes]]: ...
 
 
+@dataclass(frozen=True)
+class _File:
+    """One open file of a bag.
+
+    ``digests`` are the types' hashes by topic where the bag says them; ``unpack`` undoes the
+    compression of single messages.
+    """
+
+    name: str
+    storage: _Storage
+    digests: Mapping[str, str] = field(default_factory=dict)
+    unpack: Callable[[bytes], bytes] = bytes
+
+
 @dataclass
 class Bag:
     """An open recording.
@@ -143,7 +163,7 @@ class Bag:
     namespace: str
     lost: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    _storages: list[tuple[str, _Storage]] = field(default_factory=list)
+    _files: list[_File] = field(default_factory=list)
 
     def messages(self, *topics: Topic) -> Iterator[Recorded]:
         """Yield the messages of the given topics (default: all of `TOPICS`) as recorded.
@@ -154,28 +174,26 @@ class Bag:
             When a message does not fit its definition.
         """
         wanted = {f"{self.namespace}/{topic.name}": topic for topic in topics or TOPICS}
-        for name, storage in self._storages:
-            connections = [c for c in storage.connections if c.topic in wanted]
+        for file in self._files:
+            connections = [c for c in file.storage.connections if c.topic in wanted]
             if connections:
-                yield from self._read(name, storage, connections, wanted)
+                yield from self._read(file, connections, wanted)
 
     def _read(
-        self,
-        name: str,
-        storage: _Storage,
-        connections: Sequence[Connection],
-        wanted: dict[str, Topic],
+        self, file: _File, connections: Sequence[Connection], wanted: Mapping[str, Topic]
     ) -> Iterator[Recorded]:
         for connection in connections:
-            _check_type(connection, wanted[connection.topic], self.path)
-        messages = storage.messages(connections)
+            digest = connection.digest or file.digests.get(connection.topic, "")
+            _check_type(connection, digest, wanted[connection.topic], self.path)
+        messages = file.storage.messages(connections)
         while True:
             try:
-                connection, received_ns, data = next(messages)
+                connection, received_ns, packed = next(messages)
+                data = file.unpack(packed)
             except StopIteration:
                 return
             except Exception as exc:  # a damaged file makes the reader fail in any way it can
-                self.lost.append(f"{name}: unreadable from here on ({_reason(exc)})")
+                self.lost.append(f"{file.name}: unreadable from here on ({_reason(exc)})")
                 return
             topic = wanted[connection.topic]
             yield Recorded(topic, received_ns, _decode(data, topic, self.path))
@@ -191,16 +209,16 @@ def _decode(data: bytes, topic: Topic, path: Path) -> Any:
         ) from None
 
 
-def _check_type(connection: Connection, topic: Topic, path: Path) -> None:
+def _check_type(connection: Connection, digest: str, topic: Topic, path: Path) -> None:
     if connection.msgtype != topic.msgtype:
         raise BagError(
             f"{path}: {connection.topic} is of type {connection.msgtype}; expected {topic.msgtype}"
         )
     expected = typestore().hash_rihs01(topic.msgtype)
-    if connection.digest.startswith("RIHS01_") and connection.digest != expected:
+    if digest.startswith("RIHS01_") and digest != expected:
         raise BagError(
             f"{path}: {connection.topic} was recorded with another version of {topic.msgtype} "
-            f"({connection.digest[:15]}...); expected {expected[:15]}..."
+            f"({digest[:15]}...); expected {expected[:15]}..."
         )
 
 
@@ -224,31 +242,29 @@ def open_bag(path: str | Path, namespace: str | None = None) -> Iterator[Bag]:
     if not path.exists():
         raise BagError(f"there is no bag {path}")
     bag = Bag(path, "")
-    try:
-        _open_storages(bag)
+    with ExitStack() as stack:
+        _open_files(bag, stack)
         bag.namespace = _namespace(bag, namespace)
         yield bag
-    finally:
-        for _, storage in bag._storages:
-            storage.close()  # type: ignore[attr-defined]
 
 
-def _open_storages(bag: Bag) -> None:
-    """Open the bag as a whole; when that fails, every file of it that can be read."""
+def _open_files(bag: Bag, stack: ExitStack) -> None:
+    """Open the bag as its metadata says; when that fails, every file of it that can be read."""
     try:
-        bag._storages.append((bag.path.name, _opened(bag.path)))
+        opened = _open_directory if bag.path.is_dir() else _open_file
+        bag._files += opened(bag, bag.path, stack)
     except Exception as exc:
         _refuse_formats(exc, bag.path)
         no_metadata = isinstance(exc, FileNotFoundError)
         why = "no metadata.yaml, read file by file" if no_metadata else _reason(exc)
         (bag.notes if no_metadata else bag.lost).append(f"{bag.path.name}: {why}")
-        for file in _files(bag.path):
-            _open_file(bag, file)
-        if not bag._storages:
+        for path in _storage_files(bag.path):
+            bag._files += _open_damaged(bag, path, stack)
+        if not bag._files:
             told = "; ".join([*bag.notes, *bag.lost])
             raise BagError(
-                f"{bag.path} cannot be read: {told}; expected a rosbag2 directory "
-                "or an .mcap or .db3 file"
+                f"{bag.path} cannot be read: {told}; expected a rosbag2 directory or an .mcap or "
+                ".db3 file"
             ) from None
 
 
@@ -258,11 +274,32 @@ def _refuse_formats(exc: Exception, path: Path) -> None:
         raise BagError(f"{path} cannot be read: {_reason(exc)}; expected cdr in mcap or sqlite3")
 
 
-def _opened(path: Path) -> _Storage:
+def _open_directory(bag: Bag, path: Path, stack: ExitStack) -> list[_File]:
+    """Open the files that metadata.yaml names.
+
+    The files are read one by one: rosbags' own reading of a directory drops every message whose
+    QoS is worded differently in metadata and file, without a word.
+    """
+    reader = DirectoryReader(path)
+    reader.open()
+    stack.callback(reader.close)
+    held = sum(c.msgcount for storage in reader.storages for c in storage.connections)
+    if held != reader.metadata.message_count:
+        bag.lost.append(
+            f"{path.name}: the files hold {held} messages, {reader.metadata.message_count} were "
+            "recorded"
+        )
+    unpack = zstd.decompress if reader.metadata.compression_mode == "message" else bytes
+    digests = {c.topic: c.digest for c in reader.connections}
+    return [_File(path.name, storage, digests, unpack) for storage in reader.storages]
+
+
+def _open_file(bag: Bag, path: Path, stack: ExitStack) -> list[_File]:
     reader = Reader(path)
     reader.open()
+    stack.callback(reader.close)
     _check_cdr(reader.connections)
-    return reader
+    return [_File(path.name, reader.storage)]
 
 
 def _check_cdr(connections: Sequence[Connection]) -> None:
@@ -272,41 +309,40 @@ def _check_cdr(connections: Sequence[Connection]) -> None:
         raise ReaderError(f"Serialization format {formats!r} is not supported.")
 
 
-def _files(path: Path) -> list[Path]:
+def _storage_files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     found = [p for p in path.iterdir() if p.suffix in (".mcap", ".db3") and p.is_file()]
     return sorted(found, key=natural_key)
 
 
-def _open_file(bag: Bag, file: Path) -> None:
+def _open_damaged(bag: Bag, path: Path, stack: ExitStack) -> list[_File]:
+    """Open a file; of a damaged mcap file the whole records, of any other damaged file nothing."""
     try:
-        bag._storages.append((file.name, _opened(file)))
+        return _open_file(bag, path, stack)
     except Exception as exc:
-        _refuse_formats(exc, file)
-        if file != bag.path:
-            bag.lost.append(f"{file.name}: {_reason(exc)}")
-        if file.suffix == ".mcap":
-            _open_mended(bag, file)
+        _refuse_formats(exc, path)
+        if path != bag.path:
+            bag.lost.append(f"{path.name}: {_reason(exc)}")
+    mended = MendedPath(path) if path.suffix == ".mcap" else None
+    return _open_mended(bag, mended, stack) if mended and mended.intact else []
 
 
-def _open_mended(bag: Bag, file: Path) -> None:
-    mended = MendedPath(file)
-    if mended.intact == 0:
-        return
-    reader = _MendedMcap(mended)
+def _open_mended(bag: Bag, mended: MendedPath, stack: ExitStack) -> list[_File]:
+    reader, path = _MendedMcap(mended), mended.path
     try:
         reader.open()
+        stack.callback(reader.close)
         _check_cdr(reader.connections)
     except Exception as exc:
-        _refuse_formats(exc, file)
-        bag.lost.append(f"{file.name}: {_reason(exc)}")
-        return
-    size = file.stat().st_size
+        _refuse_formats(exc, path)
+        bag.lost.append(f"{path.name}: {_reason(exc)}")
+        return []
+    size = path.stat().st_size
     bag.lost.append(
-        f"{file.name}: the end is missing; {size - mended.intact} of {size} bytes are unreadable"
+        f"{path.name}: the end is missing; {size - mended.intact} of {size} bytes are unreadable"
     )
-    bag._storages.append((file.name, reader))
+    return [_File(path.name, reader)]
 
 
 class _MendedMcap(McapReader):
@@ -326,7 +362,7 @@ class _MendedMcap(McapReader):
 
 def _namespace(bag: Bag, wanted: str | None) -> str:
     """Namespace of the rig in the bag: the one under which images or triggers were recorded."""
-    names = {c.topic for _, storage in bag._storages for c in storage.connections}
+    names = topic_names(bag)
     found = sorted(
         {
             name.removesuffix(f"/{topic.name}")
@@ -346,7 +382,7 @@ def _namespace(bag: Bag, wanted: str | None) -> str:
 
 def topic_names(bag: Bag) -> list[str]:
     """All topics in the bag, sorted."""
-    return sorted({c.topic for _, storage in bag._storages for c in storage.connections})
+    return sorted({c.topic for file in bag._files for c in file.storage.connections})
 
 
 def _reason(exc: BaseException) -> str:
