@@ -217,6 +217,7 @@ class CameraEmulator:
         with self._lock:
             self._armed = False
             self._generation += 1
+            self._last_start_ns = 0
             self._outbox.clear()
 
     # -- edges ------------------------------------------------------------------------------
