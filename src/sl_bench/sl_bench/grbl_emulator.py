@@ -136,22 +136,22 @@ class GrblEmulator:
     def open_switches(self) -> None:
         """All limit switches open again."""
         with self._lock:
-            self.firmware.closed_switches.clear()
+            self.firmware.axes.closed_switches.clear()
 
     def remove_switches(self, *axes: int) -> None:
         """Home switches that never close: homing ends in alarm 9."""
         with self._lock:
-            self.firmware.dead_switches = frozenset(axes)
+            self.firmware.axes.dead_switches = frozenset(axes)
 
     def jam(self, stuck: bool = True) -> None:
         """Lines are answered ``ok`` but nothing moves, and the counter shows it."""
         with self._lock:
-            self.firmware.stuck = stuck
+            self.firmware.axes.stuck = stuck
 
     def lose_steps(self, share: float) -> None:
         """The carriage falls short of every move by this share; the controller cannot know."""
         with self._lock:
-            self.firmware.lost_step_share = share
+            self.firmware.axes.lost_step_share = share
 
     def power_cycle(self) -> None:
         """Power gone and back: banner, lock, position forgotten; the carriage stays."""

@@ -1,33 +1,23 @@
 """GRBL 1.1h as a machine without a port: bytes and a clock in, bytes and a position out.
 
 Behaviour after gnea/grbl 1.1h (``interface.md``, ``commands.md``, ``jogging.md``, and what its
-source does where the documents are silent). The carriage is apart from the step counter, as in
-a real stage: homing, power cycles and lost steps move one against the other.
+source does where the documents are silent).
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
+from sl_bench.grbl_axes import GrblAxes
 from sl_bench.grbl_gcode import GrblError, Modes, Order, clean, parse
-from sl_bench.grbl_motion import (
-    Block,
-    Braking,
-    HomingLeg,
-    Ramp,
-    Triple,
-    homed_position,
-    homing_legs,
-)
+from sl_bench.grbl_motion import Block, Triple
 
 VERSION = "1.1h"
 BUILD = "20190830"
 RX_BYTES = 128
 LINE_CHARS = 79
 PLANNER_BLOCKS = 15
-OVERRUN_MM = 1.0  # from the limit switch to the hard stop
 
 STAGE_SETTINGS: dict[int, float] = {
     **{0: 10, 1: 255, 2: 0, 3: 0, 4: 0, 5: 0, 6: 0, 10: 1, 11: 0.01, 12: 0.002, 13: 0},
@@ -64,16 +54,11 @@ class GrblFirmware:
         now: float = 0.0,
     ) -> None:
         self.settings = STAGE_SETTINGS | (settings or {})
-        middle = tuple(-self.settings[130 + i] / 2 for i in range(3))
-        self._carriage = carriage_mm or (middle[0], middle[1], middle[2])
-        self._counter = self._carriage if homed else (0.0, 0.0, 0.0)
+        middle = (-self.settings[130] / 2, -self.settings[131] / 2, -self.settings[132] / 2)
+        carriage = carriage_mm or middle
+        self.axes = GrblAxes(self.settings, carriage, carriage if homed else (0.0, 0.0, 0.0), now)
         self._modes = Modes()
         self._out = bytearray()
-        self.now = now
-        self.dead_switches: frozenset[int] = frozenset()
-        self.closed_switches: set[int] = set()
-        self.stuck = False
-        self.lost_step_share = 0.0
         self._state = "Idle"
         self._boot(locked=not homed and bool(self.settings[22]))
 
@@ -82,17 +67,13 @@ class GrblFirmware:
         self._rx = bytearray()
         self._line = bytearray()
         self._overflow = False
-        self._planner: deque[Block] = deque()
-        self._profile: Ramp | Braking | None = None
-        self._since, self._done = self.now, 0.0
-        self._legs: deque[HomingLeg] = deque()
         self._pending: Callable[[], bool] | None = None
-        self._critical = False
+        self._critical = self._alarm_when_halted = False
         self._owes_ok = False
         self._status_wanted = False
         self._wco_in = self._ov_in = 0
         self._overrides = [100, 100]
-        self._target = list(self._counter)
+        self._target = list(self.axes.counter)
         self._modes.reset()
         self._say("", f"Grbl {VERSION} ['$' for help]")
         self._state = "Alarm" if locked else "Idle"
@@ -104,18 +85,11 @@ class GrblFirmware:
     def carriage_mm(self, now: float) -> Triple:
         """Where the axes really stand at ``now``, mm from the home switches."""
         self.advance(now)
-        return self._carriage
+        return self.axes.carriage
 
     def counter_mm(self) -> Triple:
         """Where the controller believes that it stands (MPos), to a step."""
-        return self._on_steps(self._counter)
-
-    def _on_steps(self, place: Sequence[float]) -> Triple:
-        x, y, z = (
-            round(value * self.settings[100 + i]) / self.settings[100 + i]
-            for i, value in enumerate(place)
-        )
-        return x, y, z
+        return self.axes.on_steps(self.axes.counter)
 
     @property
     def state(self) -> str:
@@ -136,7 +110,8 @@ class GrblFirmware:
 
     def power_cycle(self) -> None:
         """Mains gone and back: the counter starts at zero wherever the carriage is."""
-        self._counter = (0.0, 0.0, 0.0)
+        self.axes.stop_dead()
+        self.axes.counter = (0.0, 0.0, 0.0)
         self._modes = Modes()
         self._out.clear()
         self._boot(locked=bool(self.settings[22]))
@@ -152,15 +127,13 @@ class GrblFirmware:
 
     def close_switch(self, axis: int) -> None:
         """A limit switch closes, whatever the place; with hard limits on that is alarm 1."""
-        self.closed_switches.add(axis)
+        self.axes.closed_switches.add(axis)
         if self.settings[21] and self._state not in ("Alarm", "Home") and not self._critical:
             self.alarm(1)
 
     def _stop_dead(self) -> None:
-        self._planner.clear()
-        self._legs.clear()
-        self._profile, self._done = None, 0.0
-        self._target = list(self._counter)
+        self.axes.stop_dead()
+        self._target = list(self.axes.counter)
 
     # -- time ---------------------------------------------------------------------------------
 
@@ -168,7 +141,6 @@ class GrblFirmware:
         """Let time pass until ``now``: motion, reports, lines that can be answered."""
         while self._step_motion(now):
             pass
-        self.now = max(self.now, now)
         if self._status_wanted and not self._critical and self._state != "Home":
             self._status_wanted = False
             self._report_status()
@@ -185,96 +157,31 @@ class GrblFirmware:
     # -- motion -------------------------------------------------------------------------------
 
     def _step_motion(self, now: float) -> bool:
-        """Advance to the next event or to ``now``; True where an event was passed."""
-        if self._legs:
-            return self._step_homing(now)
-        if self._profile is None:
-            return self._start_block()
-        elapsed = now - self._since
-        travelled, _ = self._profile.at(elapsed)
-        self._place(self._planner[0].point(self._done + travelled))
-        if elapsed < self._profile.duration or self._profile is None:
-            return False
-        self._end_profile()
-        return True
-
-    def _start_block(self) -> bool:
-        if self._state not in ("Idle", "Run", "Jog"):
-            return False
-        if not self._planner:
-            if self._state != "Idle":
-                self._state = "Idle"
-            return False
-        block = self._planner[0]
-        settings = self.settings
-        share = self._overrides[1 if math.isinf(block.speed) else 0] / 100.0
-        rates = tuple(settings[110 + i] / 60.0 * (share if share < 1 else 1.0) for i in range(3))
-        accelerations = settings[120], settings[121], settings[122]
-        self._profile = block.ramp(self._done, (rates[0], rates[1], rates[2]), accelerations)
-        self._since = self.now
-        self._state = "Jog" if block.is_jog else "Run"
-        return True
-
-    def _end_profile(self) -> None:
-        """A block is done, or a hold stands."""
-        assert self._profile is not None
-        self.now = max(self.now, self._since + self._profile.duration)
-        braked = isinstance(self._profile, Braking)
-        self._done += self._profile.at(math.inf)[0]
-        self._profile = None
-        if braked and self._state == "Jog":
+        """Let the axes pass one event; False where they have reached ``now``."""
+        event = self.axes.advance(now)
+        if event == "limit":
+            self.alarm(1)
+        elif event == "no switch":
+            self.alarm(9)
+            self._reset()  # a failed cycle resets the controller by itself
+        elif event == "homed":
+            self._target = list(self.axes.counter)
+            self._state = "Idle"
+        elif event == "braked" and self._alarm_when_halted:
+            self.alarm(2)
+        elif event == "braked" and self._state == "Jog":
             self._stop_dead()
             self._state = "Idle"
-        elif not braked or self._done >= self._planner[0].length - 1e-9:
-            self._planner.popleft()
-            self._done = 0.0
+        return self._start_block() or bool(event)
 
-    def _brake(self) -> None:
-        """Feed hold, or jog cancel: decelerate on the path."""
-        if not isinstance(self._profile, Ramp):
-            return
-        travelled, speed = self._profile.at(self.now - self._since)
-        self._done += travelled
-        self._since = self.now
-        self._profile = Braking(speed, self._profile.acceleration)
-
-    def _place(self, counter: Triple) -> None:
-        """The counter moves, and with it the carriage, as far as mechanics follow."""
-        if self.stuck:
-            return
-        step = [b - a for a, b in zip(self._counter, counter, strict=True)]
-        self._counter = counter
-        followed = 1.0 - self.lost_step_share
-        x, y, z = (
-            min(max(p + followed * d, -self.settings[130 + i] - OVERRUN_MM), OVERRUN_MM)
-            for i, (p, d) in enumerate(zip(self._carriage, step, strict=True))
-        )
-        self._carriage = x, y, z
-        if self.settings[21] and any(self._pressed(axis) for axis in range(3)):
-            self.alarm(1)
-
-    def _pressed(self, axis: int) -> bool:
-        """A switch sits just beyond either end of the travel."""
-        p, margin = self._carriage[axis], 1e-6
-        return p > margin or p < -self.settings[130 + axis] - margin
-
-    def _step_homing(self, now: float) -> bool:
-        leg = self._legs[0]
-        elapsed = now - self._since
-        self._carriage = leg.at(elapsed)
-        if elapsed < leg.duration:
+    def _start_block(self) -> bool:
+        if self._state not in ("Idle", "Run", "Jog") or self.axes.is_moving:
             return False
-        self._since += leg.duration
-        self.now = max(self.now, self._since)
-        self._legs.popleft()
-        if leg.alarm:
-            self.alarm(leg.alarm)
-            self._reset()  # a failed cycle resets the controller by itself
-        elif not self._legs:
-            self._counter = homed_position(self.settings)
-            self._target = list(self._counter)
-            self._state = "Idle"
-        return True
+        if self.axes.start_block(self._overrides[0] / 100.0, self._overrides[1] / 100.0):
+            self._state = "Jog" if self.axes.planner[0].is_jog else "Run"
+            return True
+        self._state = "Idle"
+        return False
 
     # -- real-time commands ---------------------------------------------------------------------
 
@@ -295,21 +202,21 @@ class GrblFirmware:
 
     def _want_status(self) -> None:
         self._status_wanted = True
-        self.advance(self.now)
+        self.advance(self.axes.now)
 
     def _feed_hold(self) -> None:
         if self._state == "Jog":
-            self._brake()
+            self.axes.brake()
         elif self._state in ("Idle", "Run") and not self._critical:
-            self._brake()
+            self.axes.brake()
             self._state = "Hold"
 
     def _jog_cancel(self) -> None:
         if self._state == "Jog":
-            self._brake()
+            self.axes.brake()
 
     def _cycle_start(self) -> None:
-        if self._state == "Hold" and self._profile is None:
+        if self._state == "Hold" and not self.axes.is_moving:
             self._state = "Idle"
 
     def _override(self, byte: int) -> None:
@@ -323,9 +230,9 @@ class GrblFirmware:
 
     def _reset(self) -> None:
         """0x18. In motion it costs the position; a line that waited is answered on the way out."""
-        if self._legs:
+        if self.axes.is_homing:
             self.alarm(6)
-        elif self._profile is not None:
+        elif self.axes.is_moving:
             self.alarm(3)
         if self._owes_ok:
             self._say("ok")
@@ -339,16 +246,18 @@ class GrblFirmware:
         busy = self._state in ("Run", "Jog", "Hold", "Home")
         state = self._state
         if state == "Hold":
-            state = "Hold:0" if self._profile is None else "Hold:1"
+            state = "Hold:0" if not self.axes.is_moving else "Hold:1"
         machine = self.counter_mm()
         offset = self._modes.work_offset()
         in_work = not int(self.settings[10]) & 1
         shown = [m - o for m, o in zip(machine, offset, strict=True)] if in_work else list(machine)
         fields = [state, f"{'W' if in_work else 'M'}Pos:{self._numbers(shown)}"]
         if int(self.settings[10]) & 2:
-            fields.append(f"Bf:{PLANNER_BLOCKS - len(self._planner)},{RX_BYTES - len(self._rx)}")
-        fields.append(f"FS:{self._speed_mm_min():.0f},0")
-        pins = "".join(axis for i, axis in enumerate("XYZ") if self._shows(i))
+            fields.append(
+                f"Bf:{PLANNER_BLOCKS - len(self.axes.planner)},{RX_BYTES - len(self._rx)}"
+            )
+        fields.append(f"FS:{self.axes.speed_mm_s() * 60.0:.0f},0")
+        pins = "".join(axis for i, axis in enumerate("XYZ") if self.axes.shows_pin(i))
         fields += [f"Pn:{pins}"] if pins else []
         self._say("<" + "|".join(fields + list(self._slow_fields(busy, offset))) + ">")
 
@@ -370,12 +279,6 @@ class GrblFirmware:
         if self.settings[13]:
             return ",".join(f"{value / 25.4:.4f}" for value in values)
         return ",".join(f"{value + 0.0:.3f}" for value in values)
-
-    def _speed_mm_min(self) -> float:
-        return self._profile.at(self.now - self._since)[1] * 60.0 if self._profile else 0.0
-
-    def _shows(self, axis: int) -> bool:
-        return self._pressed(axis) or axis in self.closed_switches
 
     # -- lines --------------------------------------------------------------------------------
 
@@ -429,11 +332,11 @@ class GrblFirmware:
         over: list[float] = []
 
         def waited() -> bool:
-            if self._planner:
+            if self.axes.planner:
                 return False
             if not over:
-                over.append(self.now + seconds)
-            return self.now >= over[0]
+                over.append(self.axes.now + seconds)
+            return self.axes.now >= over[0]
 
         self._pending = waited
 
@@ -446,12 +349,12 @@ class GrblFirmware:
         if self._state == "Check":
             self._target = target
             return
-        start, goal = self._on_steps(self._target), self._on_steps(target)
+        start, goal = self.axes.on_steps(self._target), self.axes.on_steps(target)
         if goal != start:
-            self._planner.append(Block(start, goal, feed / 60.0 if feed else math.inf, is_jog))
+            self.axes.planner.append(Block(start, goal, feed / 60.0 if feed else math.inf, is_jog))
             self._target = target
-            self._pending = lambda: len(self._planner) <= PLANNER_BLOCKS
-            self._step_motion(self.now)
+            self._pending = lambda: len(self.axes.planner) <= PLANNER_BLOCKS
+            self._step_motion(self.axes.now)
 
     def _outside(self, target: list[float]) -> bool:
         return bool(self.settings[20]) and any(
@@ -460,15 +363,11 @@ class GrblFirmware:
 
     def _soft_limit(self) -> None:
         """What runs is halted smoothly first, so that the position is kept; then alarm 2."""
-        self._brake()
-
-        def halted() -> bool:
-            if isinstance(self._profile, Braking):
-                return False
+        if self.axes.is_moving:
+            self.axes.brake()
+            self._state, self._alarm_when_halted = "Hold", True
+        else:
             self.alarm(2)
-            return False
-
-        self._pending = halted
 
     # -- system commands ------------------------------------------------------------------------
 
@@ -540,8 +439,7 @@ class GrblFirmware:
         if not self.settings[22]:
             raise GrblError(5)
         self._state = "Home"
-        self._since = self.now
-        self._legs = deque(homing_legs(self._carriage, self.settings, self.dead_switches))
+        self.axes.home()
 
     def _write_setting(self, line: str) -> None:
         name, equals, text = line[1:].partition("=")
