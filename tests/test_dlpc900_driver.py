@@ -273,6 +273,14 @@ def test_methods_say_when_the_device_is_not_open():
     driver.close()
 
 
+def test_connection_closed_by_another_thread_is_not_opened_again(bench):
+    port = bench.driver._port
+    bench.driver.close()
+    with pytest.raises(DeviceLost, match="was closed"):
+        port.read(0x0100)
+    assert not bench.bus.claimed
+
+
 def test_run_without_a_sequence_is_refused(bench):
     with pytest.raises(DeviceError, match="no sequence is loaded"):
         bench.driver.run()
@@ -343,8 +351,7 @@ def test_single_fault_of_the_bus_is_not_noticed(bench, fault):
 
 def test_image_that_did_not_arrive_is_loaded_anew(bench):
     bench.driver.load(named("paper"), FAST)
-    for controller in bench.emulator._controllers:
-        controller.images.clear()
+    bench.emulator._memory.clear()
     with pytest.raises(DeviceRefused, match="error 7"):
         bench.driver.run()
     assert_next_scan_is_right(bench)

@@ -11,35 +11,31 @@ import struct
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sl_bench.dlpc900_faults import Dlpc900Faults
-from sl_bench.dlpc900_images import ImageFault, decode_image
+from sl_bench.dlpc900_memory import MAX_FLY_IMAGES, ImageMemory
+from sl_bench.dlpc900_refusal import (
+    BAD_BIT,
+    BAD_DARK,
+    BAD_DEFINITION,
+    BAD_DELAY,
+    BAD_EXPOSURE,
+    BAD_INDEX,
+    INVALID_COMMAND,
+    INVALID_PARAMETER,
+    NO_ERROR,
+    NOT_PRESENT,
+    WRONG_MODE,
+    Refusal,
+)
 from sl_bench.dlpc900_sequencer import Mirrors, OnExposure, Program, Sequencer, Slot
 from sl_projector.clock import Clock, SystemClock
 from sl_projector.dmd import DmdModel, dmd_model
 
 REPORT = 64
 BUFFER = 512
-
-NO_ERROR, INVALID_COMMAND, WRONG_MODE, INVALID_PARAMETER, NOT_PRESENT = 0, 3, 5, 6, 7
-BAD_BIT, BAD_DARK, BAD_DELAY, BAD_EXPOSURE, BAD_INDEX, BAD_DEFINITION = 10, 12, 13, 14, 15, 16
-
-_ERROR_TEXTS = {
-    INVALID_COMMAND: "Invalid command number",
-    WRONG_MODE: "Command not allowed in current mode",
-    INVALID_PARAMETER: "Invalid command parameter",
-    NOT_PRESENT: "Item referred by the parameter is not present",
-    BAD_BIT: "Pattern bit number out of range",
-    BAD_DARK: "Pattern dark time out of range",
-    BAD_DELAY: "Signal delay out of range",
-    BAD_EXPOSURE: "Pattern exposure out of range",
-    BAD_INDEX: "Pattern number out of range",
-    BAD_DEFINITION: "Invalid pattern definition",
-}
 
 # Registers that are only stored: command, bytes at power-up.
 _STORED = {
@@ -58,35 +54,7 @@ _STORED = {
 _MAX_CACHED_PATTERNS = 64
 _MODE_PATTERNS = (1, 2, 3)
 _ON_THE_FLY = 3
-_MAX_FLY_IMAGES = 18
 _LAST_PLANE = 23
-
-
-class Refusal(Exception):
-    """A command that the controller answers with NACK, and its error code."""
-
-    def __init__(self, code: int, reason: str = "") -> None:
-        super().__init__(reason)
-        self.code = code
-        self.reason = reason or _ERROR_TEXTS.get(code, "Device failure")
-
-
-@dataclass
-class _Upload:
-    """An image on its way into the controller."""
-
-    image: int
-    total: int
-    data: bytearray = field(default_factory=bytearray)
-
-
-@dataclass
-class _Controller:
-    """Images in one controller's memory; a DMD has one or two."""
-
-    width: int
-    images: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
-    upload: _Upload | None = None
 
 
 class Dlpc900Emulator:
@@ -177,9 +145,7 @@ class Dlpc900Emulator:
             self._registers = dict(_STORED)
             self._power, self._idle, self._mode = 0, 0, 1
             self._error, self._error_text = NO_ERROR, ""
-            halves = 2 if self.model.dual else 1
-            width = self.model.columns // halves
-            self._controllers = [_Controller(width) for _ in range(halves)]
+            self._memory = ImageMemory(self.model)
             self._definitions: dict[int, Slot] = {}
             self._table: tuple[Slot, ...] = ()
             self._exposures = 0
@@ -279,9 +245,9 @@ class Dlpc900Emulator:
             0x1A1B: (1, self._set_mode),
             0x1A24: (1, self._start_stop),
             0x1A2A: (6, lambda d: self._begin_image(0, d)),
-            0x1A2B: (2, lambda d: self._take_chunk(0, d)),
+            0x1A2B: (2, lambda d: self._memory.take(0, d)),
             0x1A2C: (6, lambda d: self._begin_image(1, d)),
-            0x1A2D: (2, lambda d: self._take_chunk(1, d)),
+            0x1A2D: (2, lambda d: self._memory.take(1, d)),
             0x1A31: (6, self._configure),
             0x1A34: (12, self._define),
         }
@@ -372,7 +338,7 @@ class Dlpc900Emulator:
             raise Refusal(BAD_EXPOSURE)
         if 0 < slot.dark_us < self.model.min_dark_us:
             raise Refusal(BAD_DARK)
-        if self._mode == _ON_THE_FLY and slot.image >= _MAX_FLY_IMAGES:
+        if self._mode == _ON_THE_FLY and slot.image >= MAX_FLY_IMAGES:
             raise Refusal(INVALID_PARAMETER, f"image {slot.image} on the fly")
 
     def _configure(self, data: bytes) -> None:
@@ -388,60 +354,25 @@ class Dlpc900Emulator:
         table = tuple(self._definitions[i] for i in range(entries))
         places = [(s.image, s.bit, s.depth) for s in table]
         if self.strict and places != [(s.image, s.bit, s.depth) for s in self._table]:
-            self._forget_images()
+            self._memory.clear()
+            self._cache.clear()
         self._table, self._exposures, self._paused_at = table, exposures, 0
 
-    def _forget_images(self) -> None:
-        self._cache.clear()
-        for controller in self._controllers:
-            controller.images.clear()
+    # -- mirrors -------------------------------------------------------------------------------
 
-    # -- images --------------------------------------------------------------------------------
-
-    def _begin_image(self, number: int, data: bytes) -> None:
+    def _begin_image(self, controller: int, data: bytes) -> None:
         if self._mode != _ON_THE_FLY:
             raise Refusal(WRONG_MODE)
         self._refuse_while_running()
-        if number >= len(self._controllers):
-            raise Refusal(INVALID_PARAMETER, "there is no secondary controller")
-        image, total = struct.unpack_from("<HI", data)
-        if image & 0x1F >= _MAX_FLY_IMAGES:
-            raise Refusal(INVALID_PARAMETER, f"image {image} on the fly")
-        controller = self._controllers[number]
-        controller.images.pop(image & 0x1F, None)
-        controller.upload = _Upload(image & 0x1F, total)
-
-    def _take_chunk(self, number: int, data: bytes) -> None:
-        controller = self._controllers[number] if number < len(self._controllers) else None
-        upload = controller.upload if controller else None
-        if controller is None or upload is None:
-            raise Refusal(NOT_PRESENT, "image data without its start")
-        count = struct.unpack_from("<H", data)[0] & 0x3FF
-        if len(data) - 2 < count:
-            raise Refusal(INVALID_PARAMETER, f"chunk of {len(data) - 2} bytes; it says {count}")
-        upload.data += data[2 : 2 + count]
-        if len(upload.data) < upload.total:
-            return
-        controller.upload = None
-        if len(upload.data) > upload.total:
-            raise Refusal(
-                INVALID_PARAMETER, f"{len(upload.data)} bytes of image; announced {upload.total}"
-            )
         self._cache.clear()
-        try:
-            planes = decode_image(bytes(upload.data), controller.width, self.model.rows)
-        except ImageFault as fault:
-            raise Refusal(fault.code, fault.reason) from fault
-        controller.images[upload.image] = planes
+        self._memory.begin(controller, data)
 
     def _mirrors_of(self, slot: Slot) -> Mirrors:
-        key = (slot.image, slot.bit)
+        # Of more than one bit only the most significant plane is looked at: this bench shows
+        # binary patterns.
+        key = (slot.image, slot.bit + slot.depth - 1)
         if key not in self._cache:
-            # Of more than one bit only the most significant plane is looked at: this bench
-            # shows binary patterns.
-            plane = slot.bit + slot.depth - 1
-            planes = np.hstack([c.images[slot.image][plane // 8] for c in self._controllers])
-            mirrors = (planes & np.uint8(1 << plane % 8)) != 0
+            mirrors = self._memory.plane(*key)
             mirrors = mirrors[:, ::-1] if self._registers[0x1008][0] & 1 else mirrors
             mirrors = mirrors[::-1] if self._registers[0x1009][0] & 1 else mirrors
             mirrors = np.ascontiguousarray(mirrors)
@@ -472,7 +403,7 @@ class Dlpc900Emulator:
         if not self._table:
             raise Refusal(NOT_PRESENT, "the pattern table is empty")
         used = {slot.image for slot in self._table}
-        if missing := {i for i in used for c in self._controllers if i not in c.images}:
+        if missing := {image for image in used if not self._memory.holds(image)}:
             raise Refusal(NOT_PRESENT, f"image {min(missing)} is not loaded")
         output = self._registers[{1: 0x1A1D, 2: 0x1A1E}[self._camera_output]]
         self._sequencer.start(
@@ -481,6 +412,7 @@ class Dlpc900Emulator:
                 exposures=self._exposures,
                 first=self._paused_at,
                 mirrors_of=self._mirrors_of,
+                camera_output=self._camera_output,
                 edge_delay_us=struct.unpack_from("<h", output, 1)[0],
                 trigger_in_delay_us=struct.unpack("<H", self._registers[0x1A35][:2])[0],
             )

@@ -66,8 +66,11 @@ class Program:
         Exposure to begin with (after a pause).
     mirrors_of : callable
         Renders a slot.
+    camera_output : int
+        The trigger output that the camera is wired to: 1 is high through each exposure, and so
+        stays high between patterns without dark time; 2 marks the start of each pattern.
     edge_delay_us : int
-        Delay of the rising edge of the trigger output that the camera is wired to.
+        Delay of that output's rising edge.
     trigger_in_delay_us : int
         From the edge on TRIG_IN_1 to the exposure.
     """
@@ -76,6 +79,7 @@ class Program:
     exposures: int
     first: int
     mirrors_of: Callable[[Slot], Mirrors]
+    camera_output: int
     edge_delay_us: int
     trigger_in_delay_us: int
 
@@ -163,7 +167,7 @@ class Sequencer:
             if self._faults.abort_at == exposure:
                 self._faults.abort_at, self.aborted = None, True
                 break
-            self._expose(slot, mirrors, exposure, begin_ns, program.edge_delay_us, halt)
+            self._expose(program, slot, mirrors, exposure, begin_ns, halt)
             begin_ns += (slot.exposure_us + slot.dark_us) * 1000
             exposure += 1
         self._clock.wait_until(begin_ns, halt)
@@ -179,16 +183,22 @@ class Sequencer:
         return self._edges_ns.pop() if self._edges_ns else self._clock.now_ns()
 
     def _expose(
-        self, slot: Slot, mirrors: Mirrors, exposure: int, begin_ns: int, delay_us: int,
+        self, program: Program, slot: Slot, mirrors: Mirrors, exposure: int, begin_ns: int,
         halt: threading.Event,
     ) -> None:  # fmt: skip
         self._exposure = exposure
         self._shown = mirrors
         self.start_ns.append(begin_ns)
-        if slot.trigger_out_2 and self.on_exposure is not None:
+        if self.on_exposure is not None and self._raises_edge(program, slot, exposure):
+            edge_ns = begin_ns + program.edge_delay_us * 1000
             for _ in range(self._faults.edges(exposure)):
-                self.on_exposure(
-                    mirrors, exposure, begin_ns + delay_us * 1000, slot.exposure_us * 1e-6
-                )
+                self.on_exposure(mirrors, exposure, edge_ns, slot.exposure_us * 1e-6)
         if slot.dark_us and not self._clock.wait_until(begin_ns + slot.exposure_us * 1000, halt):
             self._shown = self._dark
+
+    @staticmethod
+    def _raises_edge(program: Program, slot: Slot, exposure: int) -> bool:
+        if program.camera_output == 2:
+            return slot.trigger_out_2
+        before = program.slots[(exposure - 1) % len(program.slots)]
+        return exposure == program.first or before.dark_us > 0 or slot.wait_trigger

@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 from sl_projector import dlpc900_protocol as protocol
 from sl_projector.clock import Clock, SystemClock
-from sl_projector.errors import DeviceError, DeviceRefused, DeviceTimeout
+from sl_projector.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
 from sl_projector.transport import HidTransport
 
 REPLY_TIMEOUT_S = 2.0  # TI's own software waits so long
@@ -44,6 +44,7 @@ class Dlpc900Port:
         self._reply_timeout_s = reply_timeout_s
         self._clock: Clock = clock or SystemClock()
         self._lock = threading.RLock()
+        self._closed = False
         self._sequence = 0
         self.messages = 0
         self.reports_out = 0
@@ -57,8 +58,9 @@ class Dlpc900Port:
                 self._transport.read(_DRAIN_TIMEOUT_S)
 
     def close(self) -> None:
-        """Release the device."""
+        """Release the device; whoever still uses the port is told that it is lost."""
         with self._lock:
+            self._closed = True
             self._transport.close()
 
     def read(self, command: int, size: int = 1) -> bytes:
@@ -132,6 +134,8 @@ class Dlpc900Port:
             return exchange()
 
     def _send(self, command: int, data: bytes, *, read: bool, reply: bool) -> int:
+        if self._closed:  # pyusb would open the device again, behind everybody's back
+            raise DeviceLost("the connection to the DLPC900 was closed")
         self._sequence = self._sequence % 255 + 1  # never 0: padding would look like an answer
         packet = protocol.message(command, data, read=read, reply=reply, sequence=self._sequence)
         began_ns = self._clock.now_ns()
