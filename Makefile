@@ -23,7 +23,7 @@ help: ## this text
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 scan: venv ## install, start the bench and the graph, scan the V-groove, show numbers and pictures
-	@$(BIN)/slrig scan --up --bench --surface groove --output $(OUTPUT)/groove
+	@$(BIN)/slrig scan --up --bench --surface groove --measure groove --output $(OUTPUT)/groove
 
 test: venv ## install, run all tests
 	@$(PYTEST) -n 2 --dist loadgroup

@@ -14,7 +14,7 @@ from sl_reconstruct.cloud import Cloud
 from sl_reconstruct.cloud_files import save_pcd, save_ply
 from sl_reconstruct.height_map import HeightMap, make_height_map, save_png, save_tiff
 from sl_reconstruct.plane_fit import Plane, fit_plane
-from sl_reconstruct.reasons import REFUSALS
+from sl_reconstruct.reasons import REFUSALS, Reason
 
 #: Points that a plane is fitted to; more change nothing.
 PLANE_POINTS = 500_000
@@ -114,13 +114,15 @@ def _draw(
         drawn["picture_residual"] = "Deviation from the best plane", picture
     if cloud.present:
         drawn["picture_profile"] = "Section", pictures.profile_picture(cloud.points, title)
-    drawn["picture_refusals"] = (
-        "Why points are missing",
-        pictures.refusal_picture(
-            cloud.reason, tuple(REFUSALS.values()), _counts(cloud),
-            f"{title}\nwhy points are missing",
-        ),
-    )  # fmt: skip
+    # A live scan's message counts the reasons but does not map them.
+    if bool((cloud.reason > Reason.UNLIT).any()) or not any(cloud.refused.values()):
+        drawn["picture_refusals"] = (
+            "Why points are missing",
+            pictures.refusal_picture(
+                cloud.reason, tuple(REFUSALS.values()), _counts(cloud),
+                f"{title}\nwhy points are missing",
+            ),
+        )  # fmt: skip
     return drawn
 
 

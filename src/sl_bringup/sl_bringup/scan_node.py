@@ -1,0 +1,175 @@
+"""Client of the graph's action ``scan``: asks, shows progress, receives the cloud, writes files."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.action import ActionClient
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from sensor_msgs.msg import PointCloud2
+from sl_interfaces.action import Scan
+from sl_interfaces.msg import ScanReport
+
+from sl_bringup.progress import complain, say
+from sl_bringup.scan_result import MEASURES, check_cloud, live_report, summary, write_result
+from sl_projector.base_node import LARGE
+from sl_projector.errors import DeviceLost, DeviceTimeout, SlError
+from sl_reconstruct.messages import cloud_from_msg
+
+#: The cloud is sent before the action's result; it may still be later by so long.
+CLOUD_WAIT_S = 10.0
+DEFAULT_REPEATS = 255
+
+
+class ScanClient(Node):  # type: ignore[misc]  # rclpy carries no types
+    """Asks for one scan.
+
+    Parameters
+    ----------
+    namespace : str
+        Of the rig.
+    """
+
+    def __init__(self, namespace: str) -> None:
+        super().__init__("scan_client", namespace=namespace)
+        self._cloud: PointCloud2 | None = None
+        self._shown = ""
+        self._action = ActionClient(self, Scan, "scan")
+        self.create_subscription(PointCloud2, "reconstruct/points", self._take, LARGE)
+
+    def connect(self, patience_s: float) -> None:
+        """Wait for the graph.
+
+        Raises
+        ------
+        DeviceLost
+            When no node offers the action.
+        """
+        connected = self._until(
+            lambda: (
+                self._action.server_is_ready() and self.count_publishers("reconstruct/points") > 0
+            ),
+            patience_s,
+        )
+        if not connected:
+            raise DeviceLost(
+                f"no node offers the action {self.get_namespace()}/scan in domain "
+                f"{self.context.get_domain_id()}; start the graph with 'slrig up', or use --up"
+            )
+
+    def scan(self, goal: Scan.Goal, patience_s: float) -> tuple[Any, PointCloud2 | None]:
+        """Scan, and return the action's result and the cloud.
+
+        Raises
+        ------
+        DeviceTimeout
+            When the graph does not answer in time.
+        """
+        asked = self._action.send_goal_async(goal, feedback_callback=self._show)
+        handle = self._answer(asked, patience_s)
+        if not handle.accepted:
+            raise DeviceLost("the graph refused the scan")
+        try:
+            result = self._answer(handle.get_result_async(), patience_s).result
+        except (KeyboardInterrupt, ExternalShutdownException):
+            handle.cancel_goal_async()
+            raise
+        if result.success:
+            self._until(lambda: self._cloud is not None, CLOUD_WAIT_S)
+        return result, self._cloud
+
+    def _answer(self, future: Any, patience_s: float) -> Any:
+        if not self._until(future.done, patience_s):
+            raise DeviceTimeout(f"the graph did not answer within {patience_s:g} s")
+        return future.result()
+
+    def _until(self, condition: Callable[[], bool], patience_s: float) -> bool:
+        end_s = time.monotonic() + patience_s
+        while not condition():
+            if time.monotonic() > end_s:
+                return False
+            rclpy.spin_once(self, timeout_sec=0.05)
+        return True
+
+    def _take(self, message: PointCloud2) -> None:
+        self._cloud = message
+
+    def _show(self, message: Any) -> None:
+        told = message.feedback
+        line = f"scan: {told.stage}, attempt {told.attempt}"
+        if sys.stderr.isatty():
+            sys.stderr.write(f"\r{line}, {told.frames}/{told.count} frames {told.progress:4.0%} ")
+        elif line != self._shown:
+            complain(line)
+        self._shown = line
+
+
+def fields_of(report: ScanReport) -> dict[str, Any]:
+    """Fields of a report by name, plain values."""
+    values = {name: getattr(report, name) for name in report.get_fields_and_field_types()}
+    values["refused"] = {item.reason: item.count for item in report.refused}
+    values["attempt_messages"] = list(report.attempt_messages)
+    return values
+
+
+def _deliver(args: argparse.Namespace, result: Any, cloud: PointCloud2 | None) -> int:
+    """Write and tell what came; the exit status."""
+    report = live_report(fields_of(result.report), result.success, result.message)
+    points = None if cloud is None or not result.success else cloud_from_msg(cloud)
+    fault = check_cloud(points, report) if points is not None else ""
+    if result.success and points is None:
+        fault = "the scan succeeded, but its cloud did not arrive"
+    write_result(args.output, report, points, args.measure, not args.no_pictures)
+    for line in summary(report):
+        say(line)
+    if fault:
+        complain(f"slrig scan: {fault}")
+    say(f"results           {args.output}")
+    return 0 if result.success and not fault else 1
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--namespace", default="/sl")
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--sequence", default="")
+    parser.add_argument("--exposure", type=float, default=0.0)
+    parser.add_argument("--repeats", type=int, default=DEFAULT_REPEATS)
+    parser.add_argument("--timeout", type=float, default=120.0)
+    parser.add_argument("--measure", choices=("", *MEASURES), default="")
+    parser.add_argument("--no-pictures", action="store_true")
+    parser.add_argument("--connect-timeout", type=float, default=10.0)
+    return parser.parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Scan once; exit status 0 only when the cloud is there."""
+    args = _arguments(argv)
+    rclpy.init(args=[])
+    try:
+        client = ScanClient(args.namespace)
+        client.connect(args.connect_timeout)
+        goal = Scan.Goal(sequence=args.sequence, exposure_s=args.exposure, max_repeats=args.repeats)
+        result, cloud = client.scan(goal, args.timeout)
+        if sys.stderr.isatty():
+            sys.stderr.write("\n")
+        return _deliver(args, result, cloud)
+    except SlError as error:
+        complain(f"slrig scan: error: {error}")
+        return 1
+    except (KeyboardInterrupt, ExternalShutdownException):
+        complain("slrig scan: interrupted")
+        return 130
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
