@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +22,7 @@ DOME_HEIGHT = 0.8
 
 #: Strokes on a unit cell, x right and y up: polylines separated by spaces.
 LETTERS = {
-    "S": "80 60 20 00 03 05 25 55 75 85 88 68 28 08".replace("8", "9"),
+    "S": "02 20 50 72 73 55 25 06 07 29 59 77",
     "L": "09 00 70",
     "T": "09 79|49 40",
     "M": "00 09 44 89 80",
@@ -37,7 +39,7 @@ def _strokes(letter: str) -> list[tuple[Array, Array]]:
     segments = []
     for line in LETTERS[letter].split("|"):
         points = [np.array([int(p[0]) - 4.0, int(p[1]) - 4.5]) / 9.0 for p in line.split()]
-        segments += list(zip(points[:-1], points[1:], strict=True))
+        segments += list(itertools.pairwise(points))
     return segments
 
 
@@ -72,7 +74,7 @@ def coin_heights(height_m: float, flank_m: float) -> tuple[Array, float]:
     Flanks are ``flank_m`` wide, half of it outside the outline, in the form 3 s^2 - 2 s^3.
     """
     n = round(SIDE_M / STEP_M) + 1
-    axis = (np.arange(n) - (n - 1) / 2) * STEP_M
+    axis = (np.arange(n, dtype=np.float64) - (n - 1) / 2) * STEP_M
     radius = np.hypot(axis[np.newaxis, :], axis[:, np.newaxis])
     depth = RIM_WIDTH_M / 2 - np.abs(radius - RIM_RADIUS_M)
     for a, b in _placed_segments():

@@ -63,8 +63,8 @@ def _read_tiff(path: Path) -> Array:
 def parse_tmd(blob: bytes) -> tuple[Array, float]:
     """Heights (rows, columns) and step, metres, of a TrueMap v6 file's bytes.
 
-    Layout: magic, a comment up to NUL, then little-endian columns and rows (int32), width, height and two
-    offsets (float32), then the heights (float32), row by row.
+    Layout: magic, a comment up to NUL, then little-endian columns and rows (int32), width, height
+    and two offsets (float32), then the heights (float32), row by row.
     """
     if not blob.startswith(TMD_MAGIC):
         raise ValueError(f"starts with {blob[:20]!r}; expected {TMD_MAGIC!r}")

@@ -134,9 +134,9 @@ class Finish:
 
 FINISHES: dict[str, Finish] = {
     "matt": Finish(),
-    "painted": Finish(diffuse=1.0, texture=0.08),
+    "painted": Finish(diffuse=1.0, texture=0.05),
     # On the reference rig a flat's half vector is 8 to 16 degrees off its normal: partly saturated.
-    "metal": Finish(diffuse=0.35, specular=8.0, lobe_deg=8.0, texture=0.15, texture_m=25e-6),
+    "metal": Finish(diffuse=0.35, specular=6.0, lobe_deg=7.0, texture=0.15, texture_m=25e-6),
 }
 
 

@@ -34,7 +34,7 @@ def frame_key(seed: int, frame_number: int) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _poisson(mean: float, uniform: float) -> float:
+def _poisson(mean: float, uniform: float) -> Any:
     """Poisson number by inversion, for small means."""
     term = np.exp(-mean)
     total, count = term, 0
@@ -46,7 +46,7 @@ def _poisson(mean: float, uniform: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _read_out(mean_e: float, normal: float, read_e: float, bits: Any) -> float:
+def _read_out(mean_e: float, normal: float, read_e: float, bits: Any) -> Any:
     """Electrons that are read: Poisson of the mean plus Gaussian read noise."""
     if mean_e >= GAUSSIAN_FROM_E:
         return mean_e + np.sqrt(mean_e + read_e * read_e) * normal
@@ -55,7 +55,7 @@ def _read_out(mean_e: float, normal: float, read_e: float, bits: Any) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _quantise(dn: float, max_dn: float) -> float:
+def _quantise(dn: float, max_dn: float) -> Any:
     return min(max(np.rint(dn), 0.0), max_dn)
 
 

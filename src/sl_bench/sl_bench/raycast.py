@@ -181,7 +181,7 @@ def hole_distance(surface: Any, x: float, y: float) -> Any:
 
 
 @inlined
-def albedo(surface: Any, x: float, y: float, footprint_m: float) -> float:
+def albedo(surface: Any, x: float, y: float, footprint_m: float) -> Any:
     """Reflectance of the shape itself, relative to the finish, over a footprint of that width."""
     if surface.kind != HOLES:
         return 1.0
@@ -237,7 +237,7 @@ def height_gradient(surface: Any, x: float, y: float) -> Any:
 
 @inlined
 def _hit_profile(surface: Any, ox: float, oz: float, dx: float, dz: float, nearest: float) -> Any:
-    """First t > nearest at which the ray meets the profile's polyline, and that segment's normal."""
+    """First t > nearest at which the ray meets the polyline, and that segment's normal."""
     best, nx, nz = np.inf, 0.0, 1.0
     vertices = surface.profile_m
     for k in range(vertices.shape[0] - 1):
@@ -287,7 +287,7 @@ def _hit_sphere(surface: Any, o: Any, d: Any, nearest: float) -> Any:
 
 
 @inlined
-def _refine(surface: Any, o: Any, d: Any, above: float, below: float) -> float:
+def _refine(surface: Any, o: Any, d: Any, above: float, below: float) -> Any:
     """Root of ray height over surface between ``above`` (> 0) and ``below`` (< 0): safe Newton."""
     t = 0.5 * (above + below)
     for _ in range(60):
@@ -308,7 +308,7 @@ def _refine(surface: Any, o: Any, d: Any, above: float, below: float) -> float:
 
 
 @inlined
-def _hit_field(surface: Any, o: Any, d: Any) -> float:
+def _hit_field(surface: Any, o: Any, d: Any) -> Any:
     """First hit of a ray that comes down on a HOLES or GRID surface."""
     start = (surface.z_max_m + 1e-9 - o[2]) / d[2]
     stop = (surface.z_min_m - 1e-9 - o[2]) / d[2]
@@ -352,7 +352,7 @@ def first_hit(surface: Any, o: Any, d: Any) -> Any:
 
 
 @inlined
-def _shadow_field(surface: Any, p: Any, d: Any) -> bool:
+def _shadow_field(surface: Any, p: Any, d: Any) -> Any:
     if d[2] <= 0.0:
         return True
     level = np.hypot(d[0], d[1])
@@ -369,7 +369,7 @@ def _shadow_field(surface: Any, p: Any, d: Any) -> bool:
 
 
 @inlined
-def shadowed(surface: Any, p: Any, light: Any) -> bool:
+def shadowed(surface: Any, p: Any, light: Any) -> Any:
     """Whether the surface stands between its own point p and the light; both (x, y, z)."""
     d = (light[0] - p[0], light[1] - p[1], light[2] - p[2])
     # t is 1 at the light, about 0.1 m away: 1e-7 steps 10 nm off the point's own facet.

@@ -73,7 +73,7 @@ def light_data(rig: Rig, optics: Optics, finish: Finish) -> Light:
 
 
 @inlined
-def _fall_off(size_px: Any, u: float, v: float, loss: float) -> float:
+def _fall_off(size_px: Any, u: float, v: float, loss: float) -> Any:
     """Quadratic loss from the middle of an image to its corner."""
     w, h = 0.5 * size_px[0], 0.5 * size_px[1]
     du, dv = u - w + 0.5, v - h + 0.5
@@ -81,14 +81,14 @@ def _fall_off(size_px: Any, u: float, v: float, loss: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lattice(i: int, j: int) -> float:
+def _lattice(i: int, j: int) -> Any:
     """Random number in [-1, 1) of a lattice point."""
     bits = mix(uint64(i) * uint64(0x9E3779B97F4A7C15) + mix(uint64(j)))
     return (bits >> uint64(40)) * (2.0 / 16777216.0) - 1.0
 
 
 @inlined
-def _texture(x: float, y: float) -> float:
+def _texture(x: float, y: float) -> Any:
     """Smooth random field in [-1, 1], grain 1, over the part's own x and y."""
     i, j = np.floor(x), np.floor(y)
     fx, fy = x - i, y - j
@@ -106,7 +106,7 @@ def _unit(x: float, y: float, z: float) -> Any:
 
 
 @inlined
-def _lobe(light: Any, n: Any, to_light: Any, to_eye: Any) -> float:
+def _lobe(light: Any, n: Any, to_light: Any, to_eye: Any) -> Any:
     """Specular lobe about the mirror direction, over the half vector (Beckmann)."""
     hx, hy, hz, _ = _unit(to_light[0] + to_eye[0], to_light[1] + to_eye[1], to_light[2] + to_eye[2])
     c = n[0] * hx + n[1] * hy + n[2] * hz
@@ -116,7 +116,9 @@ def _lobe(light: Any, n: Any, to_light: Any, to_eye: Any) -> float:
 
 
 @inlined
-def _reflected(surface: Any, projector: Any, light: Any, p: Any, n: Any, d: Any, base: float) -> float:
+def _reflected(
+    surface: Any, projector: Any, light: Any, p: Any, n: Any, d: Any, base: float
+) -> Any:
     """Share of the projector's light that point p sends along -d; 0 in shadow."""
     o = projector.position_m
     lx, ly, lz, distance = _unit(o[0] - p[0], o[1] - p[1], o[2] - p[2])
@@ -131,7 +133,7 @@ def _reflected(surface: Any, projector: Any, light: Any, p: Any, n: Any, d: Any,
 
 
 @inlined
-def _defocused(depth: float, focus: float, per_m: float) -> float:
+def _defocused(depth: float, focus: float, per_m: float) -> Any:
     """Standard deviation, px, that defocus adds in quadrature."""
     return per_m * (depth - focus)
 
@@ -186,14 +188,14 @@ def trace_rows(
 
 
 @inlined
-def _slope(before: float, here: float, after: float) -> float:
+def _slope(before: float, here: float, after: float) -> Any:
     """Change per sample, by the smoother side: a jump of the surface is no slope."""
     a, b = here - before, after - here
     return a if abs(a) < abs(b) else b
 
 
 @inlined
-def gradient2(m: Any, j: int, i: int) -> float:
+def gradient2(m: Any, j: int, i: int) -> Any:
     """Squared gradient of a sample map, per camera pixel squared."""
     up, down = max(j - 1, 0), min(j + 1, m.shape[0] - 1)
     left, right = max(i - 1, 0), min(i + 1, m.shape[1] - 1)

@@ -27,7 +27,7 @@ class Levels(NamedTuple):
 
     first: float
     per_step: float
-    count: int
+    levels: int
     reach: int
     weights: NDArray[np.float32]
 
@@ -58,14 +58,14 @@ def blur_levels(lowest: float, highest: float) -> Levels:
 
 @njit(cache=True, nogil=True)
 def blurred_line(profile: Any, levels: Any) -> Any:
-    """Blurred 1-D pattern ((size + 2 reach) PHASES + 1, levels) float32, from u = -reach - 0.5 on."""
+    """Blurred 1-D pattern ((size + 2 reach) PHASES + 1, levels), from u = -reach - 0.5 on."""
     reach, size = levels.reach, profile.size
-    out = np.zeros(((size + 2 * reach) * PHASES + 1, levels.count), dtype=np.float32)
+    out = np.zeros(((size + 2 * reach) * PHASES + 1, levels.levels), dtype=np.float32)
     for entry in range(out.shape[0]):
         base, phase = entry // PHASES - reach, entry % PHASES
         for m in range(max(base - reach, 0), min(base + reach + 1, size)):
             if profile[m]:
-                for k in range(levels.count):
+                for k in range(levels.levels):
                     out[entry, k] += levels.weights[phase, m - base + reach, k]
     return out
 
@@ -74,7 +74,7 @@ def blurred_line(profile: Any, levels: Any) -> Any:
 def _level(levels: Any, variance: Any) -> Any:
     """Level below a variance, and the share of the one above."""
     q = (variance - np.float32(levels.first)) * np.float32(levels.per_step)
-    k = min(max(int(q), 0), levels.count - 2)
+    k = min(max(int(q), 0), levels.levels - 2)
     return k, q - np.float32(k)
 
 
@@ -161,7 +161,9 @@ def _down(lines: Any, weights: Any, first: int, scale: Any, out: Any) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _line_samples(maps: Any, j: int, lines: Any, levels: Any, safe: Any, even: Any, odd: Any) -> None:
+def _line_samples(
+    maps: Any, j: int, lines: Any, levels: Any, safe: Any, even: Any, odd: Any
+) -> None:
     """Light of one row of samples under a 1-D pattern; maps are (along, across, ...)."""
     for i in range(maps[0].shape[1]):
         value = maps[2][j, i]
@@ -213,7 +215,9 @@ def render_lines(
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _mirror_samples(maps: Any, j: int, mirrors: Any, levels: Any, scratch: Any, even: Any, odd: Any) -> None:
+def _mirror_samples(
+    maps: Any, j: int, mirrors: Any, levels: Any, scratch: Any, even: Any, odd: Any
+) -> None:
     """Light of one row of samples under any mirror image."""
     for i in range(maps[0].shape[1]):
         value = maps[2][j, i]

@@ -8,6 +8,7 @@ are judged against.
 from __future__ import annotations
 
 import inspect
+import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,15 +53,12 @@ class Surface:
     def height_m(self, x_m: Array, y_m: Array) -> Array:
         """Height at (x, y), arrays of one shape; at a vertical wall, its upper edge."""
         x, y = np.broadcast_arrays(np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float))
-        heights = _heights(self.data, np.ascontiguousarray(x).ravel(), np.ascontiguousarray(y).ravel())
-        return np.asarray(heights).reshape(x.shape)
+        return np.asarray(_heights(self.data, x.ravel(), y.ravel())).reshape(x.shape)
 
     def albedo(self, x_m: Array, y_m: Array) -> Array:
         """Reflectance relative to the finish, 1 except in holes; arrays of one shape."""
         x, y = np.broadcast_arrays(np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float))
-        return np.asarray(
-            _albedos(self.data, np.ascontiguousarray(x).ravel(), np.ascontiguousarray(y).ravel())
-        ).reshape(x.shape)
+        return np.asarray(_albedos(self.data, x.ravel(), y.ravel())).reshape(x.shape)
 
     def distance_m(self, points_m: Array) -> Array:
         """Unsigned distance of points (N, 3), part frame, to the surface: (N,) metres.
@@ -90,7 +88,7 @@ def _albedos(data, x, y):  # type: ignore[no-untyped-def]
 def polyline_distance_m(s_m: Array, z_m: Array, vertices_m: Array) -> Array:
     """Distance of points (s, z), each (N,), to a polyline with vertices (V, 2): (N,) metres."""
     best = np.full(np.shape(s_m), np.inf)
-    for (s0, z0), (s1, z1) in zip(vertices_m[:-1], vertices_m[1:], strict=True):
+    for (s0, z0), (s1, z1) in itertools.pairwise(vertices_m):
         length2 = (s1 - s0) ** 2 + (z1 - z0) ** 2
         along = np.clip(((s_m - s0) * (s1 - s0) + (z_m - z0) * (z1 - z0)) / length2, 0.0, 1.0)
         foot = np.hypot(s_m - s0 - along * (s1 - s0), z_m - z0 - along * (z1 - z0))
@@ -123,9 +121,7 @@ class HolePlate(Surface):
             return np.abs(z)
         distance = np.asarray(_hole_distances(self.data, points_m[:, 0], points_m[:, 1]))
         profile = np.array([[-FAR_M, -chamfer], [0.0, -chamfer], [chamfer, 0.0], [FAR_M, 0.0]])
-        return np.where(
-            np.isfinite(distance), polyline_distance_m(distance, z, profile), np.abs(z)
-        )
+        return np.where(np.isfinite(distance), polyline_distance_m(distance, z, profile), np.abs(z))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -148,7 +144,7 @@ class SphereCap(Surface):
         rim = np.hypot(r - base, z)
         over_cap = r * -cz <= base * (z - cz)  # inside the cone over the rim
         to_cap = np.where(over_cap, np.abs(np.hypot(r, z - cz) - radius), rim)
-        return np.minimum(to_cap, np.where(r >= base, np.abs(z), rim))
+        return np.asarray(np.minimum(to_cap, np.where(r >= base, np.abs(z), rim)))
 
 
 class GridSurface(Surface):
@@ -190,7 +186,14 @@ def _profile(name: str, vertices_m: list[tuple[float, float]]) -> ProfileSurface
     return ProfileSurface(
         name,
         raycast.SurfaceData(
-            raycast.PROFILE, _params(), vertices, _NO_GRID, float(z.min()), float(z.max()), slope, 1.0
+            raycast.PROFILE,
+            _params(),
+            vertices,
+            _NO_GRID,
+            float(z.min()),
+            float(z.max()),
+            slope,
+            1.0,
         ),
     )
 
@@ -202,7 +205,9 @@ def flat() -> ProfileSurface:
 
 def groove(included_angle_deg: float = 155.92, width_m: float = 6e-3) -> ProfileSurface:
     """Return a V-groove along y in the plane z = 0; the paper's has 155.92 degrees (Table 2)."""
-    _check(0.0 < included_angle_deg < 180.0, "included_angle_deg", included_angle_deg, "in (0, 180)")
+    _check(
+        0.0 < included_angle_deg < 180.0, "included_angle_deg", included_angle_deg, "in (0, 180)"
+    )
     _check(width_m > 0.0, "width_m", width_m, "positive")
     depth = 0.5 * width_m / np.tan(np.deg2rad(0.5 * included_angle_deg))
     return _profile("groove", [(-width_m / 2, 0.0), (0.0, -float(depth)), (width_m / 2, 0.0)])
@@ -273,7 +278,9 @@ def hole_plate(
     if origin_diameter_m is not None:
         radii[0, 0] = origin_diameter_m / 2
     for column, row in blocked:
-        _check(0 <= column < columns and 0 <= row < rows, "blocked", (column, row), "in the lattice")
+        _check(
+            0 <= column < columns and 0 <= row < rows, "blocked", (column, row), "in the lattice"
+        )
         radii[row, column] = 0.0
     middle = ((columns - 1) / 2, (rows - 1) / 2)
     data = raycast.SurfaceData(
@@ -294,7 +301,7 @@ def _grid(name: str, heights_m: NDArray[np.floating], step_m: float) -> GridSurf
 
 
 def coin(height_m: float = 50e-6, flank_m: float = 80e-6) -> GridSurface:
-    """Return a coin-like relief: rim, letters and a dome on the plane z = 0, flanks of finite slope.
+    """Return a coin-like relief on the plane z = 0: rim, letters and a dome, flanks sloped.
 
     Parameters
     ----------

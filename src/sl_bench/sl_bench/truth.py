@@ -46,9 +46,7 @@ def lit(surface: Any, camera: Any, projector: Any, q_px: Any) -> Any:
         if not t < np.inf:
             continue
         u, v, _ = raycast.project(projector, p[0], p[1], p[2])
-        inside = (
-            -0.5 <= u <= projector.size_px[0] - 0.5 and -0.5 <= v <= projector.size_px[1] - 0.5
-        )
+        inside = -0.5 <= u <= projector.size_px[0] - 0.5 and -0.5 <= v <= projector.size_px[1] - 0.5
         facing = n[0] * (o[0] - p[0]) + n[1] * (o[1] - p[1]) + n[2] * (o[2] - p[2]) > 0.0
         out[i] = inside and facing and not raycast.shadowed(surface, p, o)
     return out

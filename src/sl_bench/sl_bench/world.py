@@ -8,6 +8,7 @@ them. World frame: metres, z = 0 the reference plane, z up towards the devices.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import threading
 from collections import OrderedDict
@@ -41,7 +42,7 @@ def in_strips(work: Callable[[tuple[int, int]], None], rows: int) -> None:
     threads = os.cpu_count() or 1
     edges = np.linspace(0, rows, min(threads * STRIPS_PER_THREAD, rows) + 1).astype(int)
     with ThreadPoolExecutor(threads) as pool:
-        for _ in pool.map(work, [(int(a), int(b)) for a, b in zip(edges, edges[1:], strict=False)]):
+        for _ in pool.map(work, [(int(a), int(b)) for a, b in itertools.pairwise(edges)]):
             pass
 
 
@@ -92,11 +93,16 @@ class World:
     """
 
     def __init__(
-        self, rig: Rig, surface: Surface, optics: Optics | None = None, finish: Finish | str = "matt"
+        self,
+        rig: Rig,
+        surface: Surface,
+        optics: Optics | None = None,
+        finish: Finish | str = "matt",
     ) -> None:
         self.rig = rig
         self.optics = optics or Optics()
-        self._lock = threading.RLock()
+        self._scene_lock = threading.Lock()
+        self._render_lock = threading.Lock()
         self._frames: OrderedDict[tuple[object, ...], Image] = OrderedDict()
         self._geometry: tuple[object, Geometry] | None = None
         self._weights = stripes.lens_weights(self.optics.lens_blur_px)
@@ -126,16 +132,15 @@ class World:
             raise ConfigError(f"pose {R.tolist()}, {t.tolist()}; expected 3x3 and 3 finite numbers")
         if np.abs(R @ R.T - np.eye(3)).max() > ORTHONORMAL_TOLERANCE or np.linalg.det(R) < 0:
             raise ConfigError(f"pose rotation {R.tolist()}; expected an orthonormal matrix, det +1")
-        with self._lock:
+        with self._scene_lock:
             s = self._scene
             self._scene = Scene(s.surface, s.finish, R, t, s.part_number)
 
     def put(self, surface: Surface, finish: Finish | str | None = None) -> None:
         """Exchange the part, at the pose where the old one stood; the finish stays unless given."""
-        with self._lock:
+        with self._scene_lock:
             s = self._scene
             new = s.finish if finish is None else _finish(finish)
-            self._frames.clear()
             self._scene = Scene(surface, new, s.rotation, s.translation_m, s.part_number + 1)
 
     # -- light -----------------------------------------------------------------------------
@@ -154,23 +159,34 @@ class World:
         ConfigError
             When the shape is not the rig's DMD.
         """
+        return self._projected(self._scene, mirrors)
+
+    def _projected(self, scene: Scene, mirrors: Mirrors) -> Image:
         columns, rows = self.rig.projector.image_size
         if mirrors.shape != (rows, columns):
             raise ConfigError(f"mirrors.shape={mirrors.shape}; expected {(rows, columns)}")
-        with self._lock:
-            scene, on = self._scene, np.ascontiguousarray(mirrors) != 0
-            key = (*scene.key, hashlib.blake2b(on.tobytes(), digest_size=16).digest())
+        on = np.ascontiguousarray(mirrors) != 0
+        shown = hashlib.blake2b(on.tobytes(), digest_size=16).digest()
+        return self._kept(scene, shown, lambda: self._render(self._traced(scene), on))
+
+    def ambient_e_per_s(self) -> Image:
+        """Noise-free electrons per second of the ambient light, (H, W), read-only."""
+        return self._ambient(self._scene)
+
+    def _ambient(self, scene: Scene) -> Image:
+        return self._kept(scene, b"ambient", lambda: self._traced(scene).ambient)
+
+    def _kept(self, scene: Scene, what: bytes, make: Callable[[], Image]) -> Image:
+        """Return an image from the cache, made first where it is not in it."""
+        with self._render_lock:
+            key = (*scene.key, what)
             if key not in self._frames:
-                self._frames[key] = _read_only(self._render(self._traced(scene), on))
+                self._frames[key] = make()
+                self._frames[key].flags.writeable = False
                 if len(self._frames) > CACHED_FRAMES:
                     self._frames.popitem(last=False)
             self._frames.move_to_end(key)
             return self._frames[key]
-
-    def ambient_e_per_s(self) -> Image:
-        """Noise-free electrons per second of the ambient light, (H, W), read-only."""
-        with self._lock:
-            return self._traced(self._scene).ambient
 
     def expose(
         self, parts: Iterable[tuple[Mirrors, float]], exposure_s: float, frame_number: int
@@ -191,17 +207,18 @@ class World:
         ndarray, (H, W)
             uint8, or uint16 for 10 and 12 bits.
         """
-        with self._lock:
-            electrons = self.ambient_e_per_s() * np.float32(exposure_s)
-            for mirrors, seconds in parts:
-                electrons += self.electrons_per_second(mirrors) * np.float32(seconds)
+        scene = self._scene
+        electrons: Image = self._ambient(scene) * np.float32(exposure_s)
+        for mirrors, seconds in parts:
+            electrons += self._projected(scene, mirrors) * np.float32(seconds)
         return self._digitised(electrons, frame_number)
 
     def _digitised(
         self, electrons: Image, frame_number: int
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
         optics = self.optics
-        out = np.empty(electrons.shape, dtype=np.uint8 if optics.bits == 8 else np.uint16)
+        dtype = np.uint8 if optics.bits == 8 else np.uint16
+        out: NDArray[np.uint8] | NDArray[np.uint16] = np.empty(electrons.shape, dtype=dtype)
         sensor = (optics.dn_per_e, optics.read_noise_e, float(optics.max_dn))
         key = np.uint64(photons.frame_key(np.uint64(optics.seed), np.uint64(frame_number)))
         in_strips(lambda r: photons.digitise(electrons, r, sensor, key, out), out.shape[0])
@@ -216,9 +233,10 @@ class World:
 
     def _trace(self, scene: Scene) -> Geometry:
         light = shading.light_data(self.rig, self.optics, scene.finish)
-        parts = (*self._data(scene), light, self._margin)
+        margin = self._weights.shape[1] // 2
+        parts = (*self._data(scene), light, margin)
         width, height = self.rig.camera.image_size
-        shape = (2 * (height + 2 * self._margin), 2 * (width + 2 * self._margin))
+        shape = (2 * (height + 2 * margin), 2 * (width + 2 * margin))
         maps = tuple(np.empty(shape, dtype=np.float32) for _ in range(6))
         in_strips(lambda r: shading.trace_rows(*parts, r, maps), shape[0])
         u, v, lit, ambient, along_u, along_v = maps
@@ -227,11 +245,7 @@ class World:
         in_strips(lambda r: stripes.render_plain(ambient, self._weights, scale, r, plain), height)
         in_strips(lambda r: shading.blur_rows(maps, r), shape[0])
         levels = (_levels(along_u, lit, self.optics), _levels(along_v, lit, self.optics))
-        return Geometry((u, v, lit, along_u, along_v), levels, _read_only(plain))
-
-    @property
-    def _margin(self) -> int:
-        return int(self._weights.shape[1] // 2)
+        return Geometry((u, v, lit, along_u, along_v), levels, plain)
 
     def _render(self, geometry: Geometry, on: NDArray[np.bool_]) -> Image:
         width, height = self.rig.camera.image_size
@@ -318,13 +332,15 @@ class World:
         """Standard deviation (N,) of a stripe's edge at pixels (N, 2), camera px.
 
         Along the camera row for column stripes, along the camera column for row stripes:
-        ``sqrt(lens^2 + (projector / |grad|)^2 + 1/12) |grad| / |grad along the line|``, where grad is
-        the gradient of the DMD coordinate over the camera's pixels. NaN where a ray meets nothing.
+        ``sqrt(lens^2 + (projector / |grad|)^2 + 1/12) |grad| / |grad along the line|``, where grad
+        is the gradient of the DMD coordinate over the camera's pixels. NaN where a ray meets
+        nothing.
         """
         k, q, o = 0 if axis == "column" else 1, _pixels(q_px), self.optics
         scene = self._data(self._scene)
         found, slope = np.asarray(truth.projector_map(*scene, q)), truth.gradients(scene, k, q)
-        off_focus = found[:, 2:] - (self.rig.projector.translation_m[2], self.rig.camera.translation_m[2])
+        focus_m = [d.translation_m[2] for d in (self.rig.projector, self.rig.camera)]
+        off_focus = found[:, 2:] - focus_m
         projector2 = o.projector_blur_px**2 + (o.projector_defocus_px_per_m * off_focus[:, 0]) ** 2
         lens2 = o.lens_blur_px**2 + (o.lens_defocus_px_per_m * off_focus[:, 1]) ** 2
         steep2 = np.sum(slope**2, axis=1)
@@ -348,11 +364,6 @@ def _finish(finish: Finish | str) -> Finish:
 
 def _pixels(q_px: Array) -> Array:
     return np.ascontiguousarray(np.atleast_2d(np.asarray(q_px, dtype=np.float64)))
-
-
-def _read_only(image: Image) -> Image:
-    image.flags.writeable = False
-    return image
 
 
 def _levels(variance: Image, lit: Image, optics: Optics) -> stripes.Levels:
