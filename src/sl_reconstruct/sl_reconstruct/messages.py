@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 _PIXELS: dict[str, np.dtype[Any]] = {"mono8": np.dtype(np.uint8), "mono16": np.dtype("<u2")}
 
 
-@dataclass(frozen=True)
+@dataclass
 class Stack:
     """All images of one scan.
 
@@ -41,8 +41,8 @@ class Stack:
         The scan.
     sequence : PatternSequence
         One pattern per image.
-    images : ndarray, (N, H, W), uint8 or uint16
-        View into the message.
+    images : ndarray, (N, H, W), uint8 or uint16, or None
+        View into the message; None once they were taken.
     stamps_ns : tuple of int
         Start of each exposure.
     exposure_s : float
@@ -51,9 +51,16 @@ class Stack:
 
     scan_id: int
     sequence: PatternSequence
-    images: NDArray[Any]
+    images: NDArray[Any] | None
     stamps_ns: tuple[int, ...]
     exposure_s: float
+
+    def take_images(self) -> NDArray[Any]:
+        """Hand the images over: their memory is free as soon as the taker drops them."""
+        images, self.images = self.images, None
+        if images is None:
+            raise StackError(f"the images of scan {self.scan_id} were taken already")
+        return images
 
 
 def stack_from_msg(message: PatternStack) -> Stack:

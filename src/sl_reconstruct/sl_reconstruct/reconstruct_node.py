@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
@@ -91,6 +92,7 @@ class ReconstructNode(RigNode):
         self._workshop = Workshop(self._declare_settings())
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="reconstruct")
         self._waiting = threading.Semaphore(MAX_WAITING + 1)
+        self._stacks: deque[tuple[Stack, int]] = deque()
         self._scanning = threading.Lock()
         self._watch: ScanWatch | None = None
         self._last_id = 0
@@ -260,7 +262,8 @@ class ReconstructNode(RigNode):
             self._waiting.release()
             self._finish(message.scan_id, error)
             raise
-        self._worker.submit(self._process, stack, came_ns)
+        self._stacks.append((stack, came_ns))
+        self._worker.submit(self._process)
 
     def _watch_of(self, scan_id: int) -> ScanWatch | None:
         watch = self._watch
@@ -270,8 +273,9 @@ class ReconstructNode(RigNode):
         if watch := self._watch_of(scan_id):
             watch.finished(result)
 
-    def _process(self, stack: Stack, came_ns: int) -> None:
+    def _process(self) -> None:
         """Reconstruct, publish, report; runs in the worker's thread."""
+        stack, came_ns = self._stacks.popleft()
         try:
             report = self._reconstruct(stack, came_ns)
         except SlError as error:
@@ -293,7 +297,8 @@ class ReconstructNode(RigNode):
         if not self._workshop.calibration_hash:
             raise CalibrationError(f"no calibration is in force: {self._calibration_fault}")
         began_s = time.perf_counter()
-        product = self._workshop(stack.images, stack.sequence)
+        # The images are let go before the cloud is published, which needs as much memory again.
+        product = self._workshop(stack.take_images(), stack.sequence)
         computed_s = time.perf_counter() - began_s
         self._clouds.publish(cloud_to_msg(product.cloud.points, stack.stamps_ns[0], WORLD_FRAME))
         done_ns = time.time_ns()
