@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from sl_bench.bench_control import ControlServer
 from sl_bench.bench_settings import BenchSettings, read_settings
-from sl_bench.camera_emulator import CameraEmulator, Exposure
+from sl_bench.camera_emulator import CameraEmulator, Exposure, Position
 from sl_bench.camera_faults import CameraFaults
 from sl_bench.dlpc900_emulator import Dlpc900Emulator
 from sl_bench.dlpc900_faults import Dlpc900Faults
@@ -40,6 +40,9 @@ STAGE_FAULTS = (
     "noise", "lose_replies", "delay_replies", "fall_silent", "alarm", "close_switch",
     "open_switches", "remove_switches", "jam", "lose_steps", "power_cycle",
 )  # fmt: skip
+
+#: The stage rests when it is found twice in the same place, so much apart.
+REST_S = 0.02
 
 
 class Bench:
@@ -82,10 +85,14 @@ class Bench:
         )
         self.dmd.on_exposure = self.camera.on_exposure
         self._timers: list[threading.Timer] = []
+        self._world_lock = threading.Lock()
+        self._ended = threading.Event()
+        self._preparer = threading.Thread(target=self._prepare_loop, name="preparer", daemon=True)
 
     def start(self) -> None:
         """Open all endpoints; the first frame is rendered before, so that no scan waits for it."""
         self._render(Exposure(0, [(self.dmd.mirrors_now(), 0.01)], 0.01, self.stage.position_m()))
+        self._preparer.start()
         self._usb_server = UsbSocketServer(str(self._dir / "usb.sock"), self.usb)
         self.stage.start()
         self.stage.link(self._dir / "stage")
@@ -95,6 +102,8 @@ class Bench:
 
     def close(self) -> None:
         """Close and remove all endpoints."""
+        self._ended.set()
+        self._preparer.join()
         for timer in self._timers:
             timer.cancel()
         self._control.close()
@@ -115,10 +124,29 @@ class Bench:
         self.close()
 
     def _render(self, exposure: Exposure) -> NDArray[Any]:
-        self.world.move(*self._mounting.pose(exposure.stage_m))
         # The lamp scales time, not mirrors, so that the world's cache of noise-free frames holds.
         shown = [(mirrors, seconds * self._lamp) for mirrors, seconds in exposure.shown]
-        return self.world.expose(shown, exposure.exposure_s, exposure.number)
+        with self._world_lock:
+            self.world.move(*self._mounting.pose(exposure.stage_m))
+            return self.world.expose(shown, exposure.exposure_s, exposure.number)
+
+    def _prepare_loop(self) -> None:
+        """Trace the rays as soon as the stage rests in a new place.
+
+        That takes a second or so; the first frame of a scan right after a move would wait for it.
+        """
+        before = ready = self.stage.position_m()
+        while not self._ended.wait(REST_S):
+            now = self.stage.position_m()
+            if now == before != ready:
+                self._prepare(now)
+                ready = now
+            before = now
+
+    def _prepare(self, stage_m: Position) -> None:
+        with self._world_lock:
+            self.world.move(*self._mounting.pose(stage_m))
+            self.world.ambient_e_per_s()
 
     # -- control ----------------------------------------------------------------------------
 
@@ -137,9 +165,10 @@ class Bench:
         unknown = set(part) - {"surface", "parameters", "finish"}
         if unknown or "surface" not in part:
             raise ConfigError(f"put {dict(part)}; expected surface, and parameters, finish")
-        self.world.put(
-            make_surface(part["surface"], **part.get("parameters", {})), part.get("finish")
-        )
+        surface = make_surface(part["surface"], **part.get("parameters", {}))
+        with self._world_lock:
+            self.world.put(surface, part.get("finish"))
+        self._prepare(self.stage.position_m())
         return {}
 
     def _set_lamp(self, brightness: float) -> dict[str, Any]:
@@ -154,10 +183,12 @@ class Bench:
         if not isinstance(what, dict) or set(what) != {"points"}:
             raise ConfigError(f"truth {what!r}; expected 'rig' or {{'points': [[u, v], ...]}}")
         pixels = np.array(what["points"], dtype=np.float64).reshape(-1, 2)
-        points = self.world.truth_points(pixels)
+        with self._world_lock:
+            self.world.move(*self._mounting.pose(self.stage.position_m()))
+            points, lit = self.world.truth_points(pixels), self.world.truth_lit(pixels)
         return {
             "points_m": [p.tolist() if np.isfinite(p).all() else None for p in points],
-            "lit": self.world.truth_lit(pixels).tolist(),
+            "lit": lit.tolist(),
         }
 
     def _state(self, _: object) -> dict[str, Any]:

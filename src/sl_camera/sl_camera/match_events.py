@@ -260,7 +260,7 @@ class MatcherSettings:
     jitter_fraction: float = 0.1
     clock_offset_s: float = 0.0
     settle_s: float = 0.008
-    timeout_s: float = 1.0
+    timeout_s: float = 3.0
     early_image_s: float = 1.0
     require_pose: bool = True
     pose_max_age_s: float = 2.0
