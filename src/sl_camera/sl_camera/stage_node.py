@@ -12,14 +12,25 @@ from sl_interfaces.srv import MoveStage
 from std_srvs.srv import Trigger
 
 from sl_camera.grbl import GrblStage
+from sl_camera.manual_stage import ManualStage
 from sl_camera.messages import stage_pose
 from sl_camera.stage import Position, StageDriver, StageState
+from sl_camera.zaber import ZaberAxis, ZaberStage
 from sl_projector.base_node import EVENTS, WORLD_FRAME, Health, RigNode, run
 from sl_projector.device_link import DeviceLink
-from sl_projector.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout, SlError
+from sl_projector.errors import (
+    ConfigError,
+    DeviceError,
+    DeviceLost,
+    DeviceRefused,
+    DeviceTimeout,
+    SlError,
+)
 
 #: While it moves, a position is at most so old (`StageDriver.position_m`).
 MOVING_AGE_NS = 200_000_000
+
+KINDS = ("grbl", "zaber", "manual")
 
 _LEVELS = {"idle": "ok", "moving": "ok", "homing": "ok", "hold": "warn", "not_homed": "warn"}
 
@@ -40,7 +51,7 @@ class StageNode(RigNode):
     ) -> None:
         super().__init__("stage", **options)
         self._declare_parameters()
-        self._make_driver = make_driver or self._make_grbl
+        self._make_driver = make_driver or self._make_configured
         self._moves = 0
         self._state = StageState("lost", "not connected yet")
         self._stop = threading.Event()
@@ -49,12 +60,18 @@ class StageNode(RigNode):
         self._serve(Trigger, "stage/home", self._home)
         self._serve(Trigger, "stage/stop", self._halt)
         self._serve(Trigger, "stage/clear", self._clear)
+        if self._kind == "manual":
+            self._serve(Trigger, "stage/confirm", self._confirm)
+            self._serve(Trigger, "stage/give_up", self._give_up)
         self._link = DeviceLink("stage", self._connect, self.say)
         self._link.start()
         self._poller = threading.Thread(target=self._poll, name="stage pose", daemon=True)
         self._poller.start()
 
     def _declare_parameters(self) -> None:
+        self._kind = self.declare("kind", "grbl", f"driver: one of {KINDS}")
+        if self._kind not in KINDS:
+            raise ConfigError(f"kind={self._kind!r}; expected one of {KINDS}")
         self._port = self.declare("port", "", "serial port, such as /dev/ttyUSB0")
         self._baud = self.declare("baud", 115200, "bits per second", 1200, 4_000_000)
         self._origin_mm = self.declare(
@@ -66,6 +83,12 @@ class StageNode(RigNode):
         )
         self._speed_m_s = self.declare(
             "speed_m_s", 0.0, "speed of moves, m/s; 0: the controller's limit", 0.0, 1.0
+        )
+        self._zaber_devices = self.declare(
+            "zaber_devices", [1, 2, 3], "addresses of the Zaber devices of x, y, z"
+        )
+        self._zaber_microstep_m = self.declare(
+            "zaber_microstep_m", [0.047625e-6] * 3, "microstep of x, y, z, m (data sheet)"
         )
         self._home_at_start = self.declare("home_at_start", False, "home after connecting")
         self._period_s = 1.0 / self.declare("pose_rate_hz", 20.0, "poses a second", 1.0, 100.0)
@@ -90,9 +113,15 @@ class StageNode(RigNode):
         self._poller.join(timeout=5.0)
         super().close()
 
-    def _make_grbl(self) -> StageDriver:
+    def _make_configured(self) -> StageDriver:
+        if self._kind == "manual":
+            return ManualStage()
         if not self._port:
             raise ConfigError("the parameter port is empty; expected a serial port")
+        if self._kind == "zaber":
+            parts = zip(self._zaber_devices, self._zaber_microstep_m, self._signs, strict=True)
+            axes = [ZaberAxis(device, 1, step_m, sign) for device, step_m, sign in parts]
+            return ZaberStage(self._port, axes, baud=self._baud)
         x, y, z = self._signs
         return GrblStage(
             self._port,
@@ -207,6 +236,21 @@ class StageNode(RigNode):
         driver.clear()
         state = driver.state()
         response.success, response.message = True, f"cleared: {state.kind} {state.text}".rstrip()
+
+    def _confirm(self, driver: StageDriver, _request: Any, response: Any) -> None:
+        """Take the operator's word that a manual stage stands where it was asked to."""
+        _manual(driver).confirm()
+        response.success, response.message = True, "confirmed"
+
+    def _give_up(self, driver: StageDriver, _request: Any, response: Any) -> None:
+        _manual(driver).give_up("the operator gave up")
+        response.success, response.message = True, "given up; clear when it is safe"
+
+
+def _manual(driver: StageDriver) -> ManualStage:
+    if not isinstance(driver, ManualStage):
+        raise DeviceRefused("this stage moves by itself; there is nothing to confirm")
+    return driver
 
 
 def parse_origin(text: str) -> Position | None:
