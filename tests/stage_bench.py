@@ -81,6 +81,35 @@ class StageBench:
         return self.stage
 
 
+class Mover(threading.Thread):
+    """A move in the background, and how it ended."""
+
+    def __init__(self, stage: StageDriver, *target: float) -> None:
+        super().__init__()
+        self._stage, self._target = stage, target
+        self.error: DeviceError | None = None
+        self.start()
+        until(lambda: stage.state().kind == "moving")
+
+    def run(self) -> None:
+        try:
+            self._stage.move_to(*self._target)
+        except DeviceError as error:
+            self.error = error
+
+    def ended(self) -> DeviceError | None:
+        self.join(10.0)
+        assert not self.is_alive()
+        return self.error
+
+
+def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "it never came true"
+        time.sleep(0.005)
+
+
 @contextmanager
 def stage_bench(kind: str) -> Iterator[StageBench]:
     """Make a bench: ``grbl``, ``zaber``, ``manual``, or ``grbl=PORT`` for hardware."""

@@ -14,9 +14,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from sl_camera.stage import Position, StageDriver
-from sl_projector.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
-from stage_bench import StageBench, stage_bench
+from sl_camera.stage import Position
+from sl_projector.errors import DeviceLost, DeviceRefused, DeviceTimeout
+from stage_bench import Mover, StageBench, stage_bench
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -32,35 +32,6 @@ def bench(kind: str) -> Iterator[StageBench]:
     with stage_bench(kind) as made:
         yield made
     assert set(threading.enumerate()) <= before, "a thread is left over"
-
-
-class Mover(threading.Thread):
-    """A move in the background, and how it ended."""
-
-    def __init__(self, stage: StageDriver, *target: float) -> None:
-        super().__init__()
-        self._stage, self._target = stage, target
-        self.error: DeviceError | None = None
-        self.start()
-        until(lambda: stage.state().kind == "moving")
-
-    def run(self) -> None:
-        try:
-            self._stage.move_to(*self._target)
-        except DeviceError as error:
-            self.error = error
-
-    def ended(self) -> DeviceError | None:
-        self.join(10.0)
-        assert not self.is_alive()
-        return self.error
-
-
-def until(condition: object, timeout_s: float = 5.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():  # type: ignore[operator]
-        assert time.monotonic() < deadline, "it never came true"
-        time.sleep(0.005)
 
 
 def place(bench: StageBench) -> Position:

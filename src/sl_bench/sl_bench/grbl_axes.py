@@ -127,8 +127,10 @@ class GrblAxes:
         if not self.planner or self._profile is not None:
             return False
         block, settings = self.planner[0], self._settings
-        share = rapid_share if math.isinf(block.speed) else min(feed_share, 1.0)
-        x, y, z = (settings[110 + i] / 60.0 * share for i in range(3))
+        x, y, z = (settings[110 + i] / 60.0 for i in range(3))
+        share = rapid_share if math.isinf(block.speed) else feed_share
+        if not block.is_jog:  # overrides leave jogs alone
+            block = block.overridden(share)
         accelerations = settings[120], settings[121], settings[122]
         self._profile = block.ramp(self._done, (x, y, z), accelerations)
         self._since = self.now

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 Triple = tuple[float, float, float]
 
@@ -77,12 +77,21 @@ class Block:
         Programmed speed, mm/s; infinite for a rapid move.
     is_jog : bool
         It came from ``$J=``.
+    rate_share : float
+        Share of the axes' rates that it may use.
     """
 
     start: Triple
     target: Triple
     speed: float
     is_jog: bool
+    rate_share: float = 1.0
+
+    def overridden(self, share: float) -> Block:
+        """The same line at a share of its speed; a rapid one at a share of the axes' rates."""
+        if math.isinf(self.speed):
+            return replace(self, rate_share=share)
+        return replace(self, speed=self.speed * share)
 
     @property
     def length(self) -> float:
@@ -94,7 +103,7 @@ class Block:
         shares = [abs(b - a) / self.length for a, b in zip(self.start, self.target, strict=True)]
         speed = min(r / s for r, s in zip(rates, shares, strict=True) if s > 0)
         acceleration = min(a / s for a, s in zip(accelerations, shares, strict=True) if s > 0)
-        return Ramp(self.length - done, min(speed, self.speed), acceleration)
+        return Ramp(self.length - done, min(speed * self.rate_share, self.speed), acceleration)
 
     def point(self, done: float) -> Triple:
         """Position after ``done`` mm."""
