@@ -171,6 +171,7 @@ class ZaberStage:
                 )
         if not reply.accepted:
             why = REJECTIONS.get(reply.data, "meaning not known")
+            why += f"; {reply.flag}: {FAULTS[reply.flag]}" if reply.flag in FAULTS else ""
             raise DeviceRefused(
                 f"Zaber device {axis.device} axis {axis.axis} rejects {data!r}: "
                 f"{reply.data} ({why})"
