@@ -123,7 +123,7 @@ def assert_right(stack: MatchedStack) -> None:
 def refusal(*scripts: Script, settings: MatcherSettings | None = None) -> FrameDecision:
     """Verdict on a spoilt scan; a good one right after it must be taken."""
     matcher = StackMatcher(settings)
-    after_ns = max(e[0] for s in scripts for e in s.events()) + 3000 * MS
+    after_ns = max(e[0] for s in scripts for e in s.events()) + 6000 * MS
     decisions = play(matcher, *scripts, Script.good(99, after_ns))
     *bad, good = verdicts(decisions)
     assert_right(stack_of(good))
@@ -630,7 +630,7 @@ def spoil_image(script: Script, rng: random.Random, fault: str, index: int) -> N
         images[j : j + 2] = [(a, y), (b, x)]
     elif fault == "late":
         # Late by less than its time-out the last image is no fault; any other comes out of order.
-        late_ms = 3000 if k == len(images) - 1 else rng.choice([60, 200, 900, 1500, 3000])
+        late_ms = 6000 if k == len(images) - 1 else rng.choice([60, 200, 900, 1500, 3000])
         images[k] = (at + late_ms * MS, event)
     elif fault == "stamp":
         images[k] = (at, replace(event, stamp_ns=event.stamp_ns + rng.choice([-1, 1]) * 14 * MS))
