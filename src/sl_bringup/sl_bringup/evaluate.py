@@ -174,13 +174,14 @@ def evaluate_bag(path: Path, output: Path, choices: Choices) -> list[dict[str, A
 
 def _count_scans(bag: Bag) -> int:
     """Scans that were begun; refuses a bag without triggers, and says what it has instead."""
+    known = len(bag.lost)
     scans = {m.message.scan_id for m in bag.messages(TRIGGER)}
     if not scans:
         raise BagError(
             f"{bag.path} has no triggers on {bag.namespace}/{TRIGGER.name}{_lost(bag)}; its topics "
             f"are {', '.join(topic_names(bag)) or 'none'}"
         )
-    bag.lost.clear()  # told again when the messages are read for good
+    del bag.lost[known:]  # told again when the messages are read for good
     return len(scans)
 
 
@@ -335,7 +336,7 @@ def parse_choices(assignments: Sequence[str]) -> tuple[Settings, MatcherSettings
     try:
         settings = Settings.from_dict({k: v for k, v in values.items() if k in of_settings})
         matching = MatcherSettings(**{k: v for k, v in values.items() if k in of_matching})
-    except TypeError as exc:
+    except (TypeError, ConfigError) as exc:
         raise ConfigError(f"--set {' '.join(assignments)}: {exc}") from None
     return settings, matching
 
@@ -343,7 +344,8 @@ def parse_choices(assignments: Sequence[str]) -> tuple[Settings, MatcherSettings
 def _value(text: str) -> Any:
     """A number, true, false, null or a word."""
     try:
-        return float(text) if "e" in text.lower() else yaml.safe_load(text)
+        value = yaml.safe_load(text)
+        return float(value) if isinstance(value, str) else value  # YAML 1.1 has no 1e1
     except (ValueError, yaml.YAMLError):
         return text
 
