@@ -10,7 +10,7 @@ from sl_bench.usb_server import EmulatedUsb
 from sl_projector.dlpc900 import Dlpc900, Dlpc900Settings
 from sl_projector.usb_socket import LinkBackend
 
-REPLY_TIMEOUT_S = 0.15
+REPLY_TIMEOUT_S = 0.3
 
 
 @dataclass

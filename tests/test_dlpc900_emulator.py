@@ -191,7 +191,7 @@ def test_tis_on_the_fly_example_runs():
     host.send(0x00, 0x1A2B, bytes.fromhex("09 00") + stream[12 * 504 :])
     assert host.read(0x0100) == b"\x00"
     assert host.write(0x1A24, *bytes.fromhex("02")) == 0
-    while len(host.edges) < 4:
+    while len(host.edges) < 5:
         threading.Event().wait(0.001)
     assert host.read(0x1A0C) == b"\x02"
     assert host.write(0x1A24, *bytes.fromhex("00")) == 0

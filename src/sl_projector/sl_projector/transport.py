@@ -56,7 +56,7 @@ def _translate(error: usb.core.USBError, doing: str) -> NoReturn:
         ) from error
     if error.errno in (errno.EACCES, errno.EPERM):
         raise DeviceError(
-            f"USB {doing}: no permission; install the udev rule and plug the device in again"
+            f"USB {doing}: no permission; install 60-sl-projector.rules (its head says how)"
         ) from error
     if error.errno in _GONE:
         raise DeviceLost(f"USB {doing}: the device is gone ({error})") from error
