@@ -1,0 +1,192 @@
+"""Import directions, sizes and habits of the code base, read from its syntax trees."""
+
+from __future__ import annotations
+
+import ast
+import re
+import statistics
+import tomllib
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PYTHON_PACKAGES = (
+    "sl_projector", "sl_camera", "sl_reconstruct", "sl_calibration", "sl_bench", "sl_bringup",
+)  # fmt: skip
+#: What each package may import of ours.
+ALLOWED = {
+    "sl_projector": set(),
+    "sl_camera": {"sl_projector"},
+    "sl_reconstruct": {"sl_projector"},
+    "sl_calibration": {"sl_projector", "sl_reconstruct"},
+    "sl_bench": {"sl_projector", "sl_camera", "sl_reconstruct"},
+    "sl_bringup": {"sl_projector", "sl_camera", "sl_reconstruct", "sl_calibration", "sl_bench"},
+}
+#: The bench sees the rig and its files, never how images are decoded: a shared error would cancel.
+BENCH_MAY_SEE = {"rig", "calibration_file", "plausible"}
+#: Device drivers and transports of the projector that nobody else has a use for, but its peers.
+DEVICE_SDKS = {"usb", "serial", "hid", "termios", "gi", "pypylon"}
+SDK_FILES = {
+    "sl_projector/transport.py", "sl_projector/usb_socket.py", "sl_camera/grbl.py",
+    "sl_camera/serial_lines.py", "sl_camera/aravis_camera.py", "sl_bench/usb_server.py",
+    "sl_bench/pty_port.py", "sl_bringup/doctor.py", "sl_bringup/doctor_checks.py",
+}  # fmt: skip
+ROS_MODULES = re.compile(
+    r"^(rclpy|rcl_interfaces|sl_interfaces|builtin_interfaces|std_srvs|rosgraph_msgs|\w+_msgs)(\.|$)"
+)
+MAX_FILE_LINES, MAX_BODY_LINES, MEDIAN_BODY_LINES, P95_BODY_LINES = 500, 60, 8, 40
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def sources() -> list[Path]:
+    return sorted(
+        file for package in PYTHON_PACKAGES
+        for file in (ROOT / "src" / package / package).rglob("*.py")
+    )  # fmt: skip
+
+
+def label(file: Path) -> str:
+    return "/".join(file.parts[-2:])
+
+
+def tree(file: Path) -> ast.Module:
+    return ast.parse(file.read_text(), str(file))
+
+
+def imports(file: Path) -> Iterator[tuple[str, int]]:
+    """Dotted names that a file imports, with the names from a package as its members."""
+    for node in ast.walk(tree(file)):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{label(file)}:{node.lineno} imports relatively"
+            yield from ((f"{node.module}.{alias.name}", node.lineno) for alias in node.names)
+
+
+FILES = [pytest.param(file, id=label(file)) for file in sources()]
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_imports_go_one_way(file: Path) -> None:
+    package = file.relative_to(ROOT / "src").parts[0]
+    for name, line in imports(file):
+        top, *rest = name.split(".")
+        if top in ALLOWED and top != package:
+            assert top in ALLOWED[package], f"{label(file)}:{line}: {package} imports {name}"
+            if package == "sl_bench" and top == "sl_reconstruct":
+                assert rest[0] in BENCH_MAY_SEE, f"{label(file)}:{line}: the bench imports {name}"
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_ros_stays_in_nodes_and_messages(file: Path) -> None:
+    if file.name.endswith("_node.py") or file.name == "messages.py":
+        return
+    found = [f"{name} (line {line})" for name, line in imports(file) if ROS_MODULES.match(name)]
+    assert not found, f"{label(file)} imports {', '.join(found)}"
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_device_sdks_stay_in_drivers(file: Path) -> None:
+    found = {name.split(".")[0] for name, _ in imports(file)} & DEVICE_SDKS
+    assert not found or label(file) in SDK_FILES, f"{label(file)} imports {found}"
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_a_file_is_short_and_its_module_says_what_it_is(file: Path) -> None:
+    assert len(file.read_text().splitlines()) <= MAX_FILE_LINES
+    assert ast.get_docstring(tree(file)), f"{label(file)} has no docstring"
+    assert "utils" not in file.stem
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_nothing_prints(file: Path) -> None:
+    calls = [node for node in ast.walk(tree(file)) if isinstance(node, ast.Call)]
+    calls = [c.lineno for c in calls if isinstance(c.func, ast.Name) and c.func.id == "print"]
+    assert not calls, f"{label(file)} prints in lines {calls}"
+
+
+def functions(file: Path) -> Iterator[Function]:
+    yield from (n for n in ast.walk(tree(file)) if isinstance(n, Function))
+
+
+def body_lines(function: Function) -> int:
+    """Lines of a body that hold code: without docstring, comments and blank lines."""
+    body = function.body
+    if ast.get_docstring(function):
+        body = body[1:]
+    nodes = [node for statement in body for node in ast.walk(statement)]
+    coded = [node for node in nodes if isinstance(node, ast.expr | ast.stmt)]
+    return len({line for node in coded for line in (node.lineno, node.end_lineno)})
+
+
+def test_functions_are_short() -> None:
+    lengths = {
+        f"{label(file)}:{f.name}": body_lines(f) for file in sources() for f in functions(file)
+    }
+    long = {name: n for name, n in lengths.items() if n > MAX_BODY_LINES}
+    assert not long
+    assert statistics.median(lengths.values()) <= MEDIAN_BODY_LINES
+    assert statistics.quantiles(lengths.values(), n=20)[-1] <= P95_BODY_LINES
+
+
+# -- packages -------------------------------------------------------------------------------------
+
+
+def manifest(package: str) -> ElementTree.Element:
+    return ElementTree.parse(ROOT / "src" / package / "package.xml").getroot()
+
+
+def test_one_version_everywhere() -> None:
+    top = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    wheel = (ROOT / "src/sl_interfaces/pyproject.toml").read_text()
+    assert tomllib.loads(wheel)["project"]["version"] == top
+    packages = ("sl_interfaces", *PYTHON_PACKAGES)
+    assert {manifest(p).findtext("version") for p in packages} == {top}
+
+
+@pytest.mark.parametrize("package", PYTHON_PACKAGES)
+def test_the_manifest_names_what_is_imported(package: str) -> None:
+    listed = {e.text for kind in ("exec_depend", "depend") for e in manifest(package).iter(kind)}
+    used = {name.split(".")[0] for file in sources() if file.parts[-2] == package
+            for name, _ in imports(file)}  # fmt: skip
+    ros = {name for name in used if ROS_MODULES.match(name) or name in ALLOWED} - {package}
+    optional = {"tf2_msgs"}
+    assert ros - optional <= listed, (
+        f"{package}/package.xml lacks {sorted(ros - optional - listed)}"
+    )
+
+
+@pytest.mark.parametrize("package", PYTHON_PACKAGES)
+def test_every_node_can_be_run_by_ros2_run(package: str) -> None:
+    setup = (ROOT / "src" / package / "setup.py").read_text()
+    for file in (ROOT / "src" / package / package).glob("*_node.py"):
+        if any(f.name == "main" for f in tree(file).body if isinstance(f, ast.FunctionDef)):
+            assert f"{package}.{file.stem}:main" in setup
+
+
+def interface_files() -> list[Path]:
+    folder = ROOT / "src" / "sl_interfaces"
+    return sorted(f for kind in ("msg", "srv", "action") for f in folder.glob(f"{kind}/*.{kind}"))
+
+
+@pytest.mark.parametrize("file", interface_files(), ids=lambda file: file.name)
+def test_every_field_says_what_it_means(file: Path) -> None:
+    lines = file.read_text().splitlines()
+    assert lines[0].startswith("# "), "the first line says what it is"
+    # A bool success and a string message are the answer's own words.
+    plain = re.compile(r"^(bool success|string message)\s*$")
+    fields = [line for line in lines if line.strip() and not line.startswith(("#", "---"))]
+    bare = [line for line in fields if "#" not in line and not plain.match(line)]
+    # A lone sub-message is explained in its own file.
+    bare = [line for line in bare if not line.startswith("sl_interfaces/")]
+    assert not bare, f"{file.name}: no meaning at {bare}"
+
+
+def test_every_interface_is_built() -> None:
+    cmake = (ROOT / "src/sl_interfaces/CMakeLists.txt").read_text()
+    missing = [label(f) for f in interface_files() if f'"{label(f)}"' not in cmake]
+    assert not missing
