@@ -14,7 +14,7 @@ import yaml
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from sl_bench.reference import reference_rig
 from sl_bringup.bag_writer import BagWriter, Storage, header, new_bag
@@ -400,3 +400,41 @@ def test_every_message_of_ros_2s_bags_is_reachable() -> None:
         assert found == info["message_count"], path
         checked += 1
     assert checked >= 19
+
+
+@pytest.mark.parametrize("mode", [CompressionMode.MESSAGE, CompressionMode.FILE])
+@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_compressed_bags_are_read(
+    tmp_path: Path, mode: CompressionMode, plugin: StoragePlugin
+) -> None:
+    writer = Writer(tmp_path / "a", version=9, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    images = frames()
+    with writer:
+        bag_writer = BagWriter(writer, "/sl")
+        fill(bag_writer, images)
+    with open_bag(tmp_path / "a") as bag:
+        got = [r.message.data.reshape(48, 64) for r in bag.messages(IMAGE)]
+        assert bag.lost == []
+    assert np.array_equal(got, images)
+
+
+def test_a_missing_part_of_a_split_bag_is_told(tmp_path: Path) -> None:
+    with new_bag(tmp_path / "a") as bag:
+        fill(bag, frames())
+    metadata = tmp_path / "a" / "metadata.yaml"
+    content = yaml.safe_load(metadata.read_text())
+    content["rosbag2_bagfile_information"]["relative_file_paths"].append("a_1.mcap")
+    metadata.write_text(yaml.safe_dump(content))
+    images, lost, _ = count_images(tmp_path / "a")
+    assert images == COUNT
+    assert "a_1.mcap" in lost[0]
+
+
+def test_fewer_messages_than_were_recorded_is_told(tmp_path: Path) -> None:
+    with new_bag(tmp_path / "a") as bag:
+        fill(bag, frames())
+    metadata = tmp_path / "a" / "metadata.yaml"
+    text = metadata.read_text()
+    metadata.write_text(text.replace("message_count: 34", "message_count: 40"))
+    assert "hold 34 messages, 40 were recorded" in count_images(tmp_path / "a")[1][0]
