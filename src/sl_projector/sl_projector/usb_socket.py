@@ -27,6 +27,7 @@ operation  meaning               payload
 from __future__ import annotations
 
 import array
+import contextlib
 import errno
 import os
 import socket
@@ -49,6 +50,7 @@ SIZE = struct.Struct("<H")
 IDENTITY = struct.Struct("<HH")
 MAX_FRAME_BYTES = 4096
 ANSWER_MARGIN_S = 5.0  # beyond a transfer's own timeout the other process is taken for dead
+RELEASE_TIMEOUT_S = 1.0
 
 ENDPOINT_OUT, ENDPOINT_IN = 0x01, 0x81
 
@@ -186,6 +188,12 @@ class SocketLink:
     def release(self) -> None:
         """See `UsbLink`; closes the connection."""
         with self._lock:
+            if self._connection is not None:
+                # Wait for the answer: the next to claim the device must find it free.
+                with contextlib.suppress(OSError):
+                    self._connection.settimeout(RELEASE_TIMEOUT_S)
+                    send_frame(self._connection, REQUEST.pack(RELEASE, 0, 0))
+                    receive_frame(self._connection)
             self._drop()
 
     def write(self, endpoint: int, report: bytes, timeout_ms: int) -> int:
