@@ -480,7 +480,7 @@ def test_memory_stays_bounded_whatever_comes() -> None:
         decisions += matcher.image(image(FOREIGN, T0 - scan * 10**12), scan)
     assert len(matcher._open) <= 2
     assert len(matcher._waiting) <= 128
-    assert len(matcher._closed) <= 8
+    assert len(matcher._closed) <= 32
     decisions += matcher.tick(10**12)
     assert sorted(v.scan_id for v in verdicts(decisions)) == list(range(1, 301))
     assert {v.status for v in verdicts(decisions)} == {Status.STACK_REFUSED}

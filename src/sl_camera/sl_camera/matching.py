@@ -35,7 +35,7 @@ __all__ = [
 #: Scans whose triggers and images may still be coming.
 MAX_OPEN = 2
 #: Scans remembered after their verdict, to tell a late image from a foreign one.
-MAX_CLOSED = 8
+MAX_CLOSED = 32
 #: Images kept while their trigger is not known.
 MAX_WAITING = 128
 #: Stack buffers kept for reuse.
