@@ -1,0 +1,245 @@
+"""The checks of ``slrig doctor``: each says what it found and, where it is bad, what mends it."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from sl_bringup.graph import GraphOptions, client_command, client_environment
+from sl_bringup.graph_config import NODES, write_config
+from sl_bringup.transport import (
+    MIB,
+    SEGMENT_BYTES,
+    SHM_DIRECTORY,
+    SMALL_SEGMENT_BYTES,
+    free_bytes,
+)
+from sl_projector.errors import SlError
+
+PYTHON_RANGE = ((3, 11), (3, 13))
+#: Module and the name under which pip knows it.
+LIBRARIES = {
+    "numpy": "numpy", "scipy": "scipy", "numba": "numba", "cv2": "opencv-python-headless",
+    "yaml": "PyYAML", "usb.core": "pyusb", "serial": "pyserial", "rosbags": "rosbags",
+    "matplotlib": "matplotlib", "plyfile": "plyfile",
+}  # fmt: skip
+DLPC900_ID = (0x0451, 0xC900)
+UDEV_FILE = Path("/etc/udev/rules.d/70-slrig.rules")
+UDEV_RULE = (
+    'SUBSYSTEM=="usb", ATTRS{idVendor}=="0451", ATTRS{idProduct}=="c900", '
+    'MODE="0660", GROUP="plugdev", TAG+="uaccess"'
+)
+INSTALL = "make venv"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the doctor.
+
+    Parameters
+    ----------
+    level : {"ok", "note", "bad"}
+        "note" is worth knowing but stops nothing.
+    subject, text : str
+        What was looked at, what was found.
+    remedy : str
+        What to do.
+    """
+
+    level: Literal["ok", "note", "bad"]
+    subject: str
+    text: str
+    remedy: str = ""
+
+
+def python() -> list[Finding]:
+    """Interpreter and environment."""
+    version = ".".join(map(str, sys.version_info[:3]))
+    low, high = PYTHON_RANGE
+    if not low <= sys.version_info[:2] <= high:
+        remedy = "install Python 3.12 and make the environment anew: make distclean venv"
+        return [Finding("bad", "python", f"{version}; the wheels of ROS are for 3.11-3.13", remedy)]
+    return [Finding("ok", "python", f"{version} in {sys.prefix}")]
+
+
+def libraries() -> list[Finding]:
+    """Libraries that the commands need."""
+    missing = [name for module, name in LIBRARIES.items() if not _there(module)]
+    if missing:
+        remedy = f"{sys.executable} -m pip install {' '.join(missing)}   (or: {INSTALL})"
+        return [Finding("bad", "libraries", f"missing: {', '.join(missing)}", remedy)]
+    return [Finding("ok", "libraries", f"all {len(LIBRARIES)} are there")]
+
+
+def _there(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def ros() -> list[Finding]:
+    """Middleware, client library and our messages."""
+    found = []
+    for subject, module, remedy in (
+        ("rclpy", "rclpy", INSTALL + "   (or source a ROS 2 Jazzy workspace)"),
+        ("middleware", "rmw_dds_common", INSTALL),
+        (
+            "sl_interfaces",
+            "sl_interfaces.action",
+            "pip install src/sl_interfaces   (or colcon build)",
+        ),
+    ):
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            found.append(Finding("bad", subject, f"cannot be imported: {error}", remedy))
+        else:
+            found.append(Finding("ok", subject, _version(subject)))
+    return found + _rmw()
+
+
+def _version(subject: str) -> str:
+    names = {"rclpy": "ros-rclpy", "sl_interfaces": "sl-interfaces"}
+    try:
+        return f"version {metadata.version(names[subject])}"
+    except (KeyError, metadata.PackageNotFoundError):
+        return "found"
+
+
+def _rmw() -> list[Finding]:
+    chosen = os.environ.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
+    if chosen != "rmw_fastrtps_cpp":
+        text = f"RMW_IMPLEMENTATION={chosen}: tools started from here would not see the graph"
+        return [Finding("note", "middleware", text, "unset RMW_IMPLEMENTATION")]
+    return []
+
+
+def shared_memory() -> list[Finding]:
+    """Room for the segments of large messages."""
+    free = free_bytes()
+    wanted = 2 * (sum(SEGMENT_BYTES.values()) + 4 * SMALL_SEGMENT_BYTES)
+    text = f"{free // MIB} MB free in {SHM_DIRECTORY}"
+    if free >= wanted:
+        return [Finding("ok", "shared memory", text)]
+    remedy = (
+        f"container: --shm-size={wanted // MIB}m or --ipc=host; host: "
+        f"mount -o remount,size={wanted // MIB}m {SHM_DIRECTORY}"
+    )
+    text += f"; {wanted // MIB} MB are needed for full speed, segments shrink until then"
+    return [Finding("note" if free >= 32 * MIB else "bad", "shared memory", text, remedy)]
+
+
+def configuration(options: GraphOptions) -> list[Finding]:
+    """Configuration file, and the calibration that it names."""
+    try:
+        # A directory of its own: the files of a running graph stay as they are.
+        config = write_config(options.source, options.directory / "doctor", options.changes)
+    except SlError as error:
+        return [Finding("bad", "configuration", str(error), "mend the file")]
+    found = [Finding("ok", "configuration", str(options.source))]
+    if options.bench:
+        return found
+    sections = yaml.safe_load(config.read_text())
+    key = f"{options.changes.namespace}/reconstruct"
+    file = sections.get(key, {}).get("ros__parameters", {}).get("calibration_file", "")
+    return [*found, _calibration(file)]
+
+
+def _calibration(file: str) -> Finding:
+    from sl_reconstruct.calibration_file import load_calibration
+
+    if not file:
+        remedy = "name one in the configuration, or --calibration FILE"
+        return Finding("bad", "calibration", "none is named; scans will be refused", remedy)
+    try:
+        calibration = load_calibration(Path(file))
+    except SlError as error:
+        return Finding("bad", "calibration", str(error), "name another file, or calibrate anew")
+    return Finding("ok", "calibration", f"{file} ({calibration.hash[:12]})")
+
+
+def projector(bench: bool) -> list[Finding]:
+    """The DLPC900 on the USB, and the permission to use it."""
+    if bench:
+        return []
+    import usb.core
+
+    try:
+        device = usb.core.find(idVendor=DLPC900_ID[0], idProduct=DLPC900_ID[1])
+    except usb.core.NoBackendError:
+        return [Finding("bad", "projector", "no libusb", "apt install libusb-1.0-0")]
+    if device is None:
+        remedy = "plug it in and switch it on; without hardware: --bench"
+        return [Finding("bad", "projector", "no DLPC900 (0451:c900) on the USB", remedy)]
+    node = Path(f"/dev/bus/usb/{device.bus:03d}/{device.address:03d}")
+    if not os.access(node, os.R_OK | os.W_OK):
+        remedy = f"echo '{UDEV_RULE}' | sudo tee {UDEV_FILE}; sudo udevadm control --reload; replug"
+        return [Finding("bad", "projector", f"no permission for {node}", remedy)]
+    return [Finding("ok", "projector", f"DLPC900 at {node}")]
+
+
+def _parameter(source: Path, node: str, name: str) -> str:
+    sections = yaml.safe_load(source.read_text()) or {}
+    return str(sections.get(f"/sl/{node}", {}).get("ros__parameters", {}).get(name, ""))
+
+
+def serial_ports(source: Path, bench: bool) -> list[Finding]:
+    """The stage's port, and the permission to use it."""
+    if bench:
+        return []
+    from serial.tools.list_ports import comports
+
+    there = [port.device for port in comports()]
+    found = [Finding("note", "serial ports", ", ".join(there) or "none on this machine")]
+    port = _parameter(source, "stage", "port")
+    if not port:
+        return [*found, Finding("note", "stage", "the configuration names no port")]
+    if not Path(port).exists():
+        remedy = "plug it in, or name another port in the configuration"
+        return [*found, Finding("bad", "stage", f"no port {port}", remedy)]
+    if not os.access(port, os.R_OK | os.W_OK):
+        remedy = "sudo usermod -aG dialout $USER, then log in again"
+        return [*found, Finding("bad", "stage", f"no permission for {port}", remedy)]
+    return [*found, Finding("ok", "stage", port)]
+
+
+def camera(source: Path, bench: bool) -> list[Finding]:
+    """The camera's address; Aravis is optional."""
+    if bench:
+        return []
+    address = _parameter(source, "camera", "address")
+    found: list[Finding] = []
+    if address.startswith("/") and not Path(address).is_socket():
+        remedy = "start the process that serves the camera, or correct the configuration"
+        found.append(Finding("bad", "camera", f"nothing serves {address}", remedy))
+    else:
+        found.append(Finding("ok", "camera", address or "no address in the configuration"))
+    text = "there" if _there("gi") else "not installed; only cameras over GenICam need it"
+    return [*found, Finding("note", "Aravis", text)]
+
+
+def graph(options: GraphOptions) -> list[Finding]:
+    """A running graph and what its nodes say."""
+    if not _there("rclpy"):
+        return []
+    command = client_command("sl_bringup.ready_node", options, "--nodes", *NODES, "--timeout", "4")
+    asked: Any = subprocess.run(
+        command, env=client_environment(options), capture_output=True, text=True, check=False
+    )
+    if asked.returncode == 0:
+        return [Finding("ok", "graph", f"running and ready in domain {options.domain}")]
+    complaint = asked.stderr.strip().removeprefix("graph not ready: ")
+    if all(f"{name} is silent" in complaint for name in NODES):
+        remedy = f"slrig up{' --bench' if options.bench else ''}"
+        return [Finding("note", "graph", f"none runs in domain {options.domain}", remedy)]
+    return [Finding("bad", "graph", complaint, "see the nodes' log; slrig up restarts dead ones")]
