@@ -472,7 +472,7 @@ def test_projector_that_begins_anew_in_the_middle() -> None:
 def test_memory_stays_bounded_whatever_comes() -> None:
     matcher = StackMatcher()
     decisions: list[FrameDecision] = []
-    for scan in range(1, 301):
+    for scan in range(1, 201):
         start_ns = T0 + scan * 3 * PERIOD
         decisions += matcher.trigger(trigger(scan, 0, start_ns), scan)
         decisions += matcher.trigger(trigger(scan, 1, start_ns), scan)
@@ -482,7 +482,7 @@ def test_memory_stays_bounded_whatever_comes() -> None:
     assert len(matcher._waiting) <= 128
     assert len(matcher._closed) <= 32
     decisions += matcher.tick(10**12)
-    assert sorted(v.scan_id for v in verdicts(decisions)) == list(range(1, 301))
+    assert sorted(v.scan_id for v in verdicts(decisions)) == list(range(1, 201))
     assert {v.status for v in verdicts(decisions)} == {Status.STACK_REFUSED}
 
 

@@ -89,8 +89,12 @@ class StackMatcher:
         """Take an image; its pixels are copied once, here or when its trigger comes."""
         decisions = list(self._advance(now_ns))
         self._arrivals += 1
-        self._waiting.append(_Waiting(event, self._arrivals, now_ns))
-        decisions += self._place_waiting(now_ns)
+        waiting = _Waiting(event, self._arrivals, now_ns)
+        decision = self._place(waiting, now_ns)
+        if decision is None:
+            self._waiting.append(waiting)
+        else:
+            decisions.append(decision)
         if len(self._waiting) > MAX_WAITING:
             decisions.append(self._foreign(self._waiting.popleft()))
         return [*decisions, *self._advance(now_ns)]
