@@ -31,7 +31,8 @@ class DeviceLink(Generic[DeviceT]):
     name : str
         What messages call the device.
     connect : callable
-        Opens the device and makes it ready; raises `SlError` or `OSError` when it cannot.
+        Opens the device and makes it ready; raises `SlError`, `OSError` or `ValueError` when it
+        cannot.
     on_change : callable
         Called from the link's thread with one line whenever the state changes.
     """
@@ -109,7 +110,7 @@ class DeviceLink(Generic[DeviceT]):
     def _try(self) -> bool:
         try:
             device = self._connect()
-        except (SlError, OSError) as error:
+        except (SlError, OSError, ValueError) as error:
             if str(error) != self.reason:
                 self._on_change(f"{self.name} not connected: {error}")
             self.reason = str(error)
