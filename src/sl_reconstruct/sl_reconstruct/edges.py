@@ -20,6 +20,10 @@ from sl_reconstruct.reasons import Reason
 
 #: Sub-pixel phases at which the noise gain of the estimator is tabulated.
 PHASES = 16
+#: A narrow shadow under an edge leaves less than this part of the light beside it.
+DIP = 0.6
+#: Secant steps; the third is below 1e-6 px, as the filtered signal is nearly straight.
+SECANTS = 3
 SQRT_2PI = float(np.sqrt(2 * np.pi))
 
 CONTRAST = int(Reason.CONTRAST)
@@ -72,12 +76,16 @@ class Tuning(NamedTuple):
 
 
 class SourceRow(NamedTuple):
-    """Scratch for one source in one row: signal, filtered signal, sums, crossings."""
+    """Scratch for one source in one row: signal, filtered signal, crossings.
+
+    ``marks`` has a byte for each pixel, and is seen as ``words``; ``at`` lists the crossings.
+    """
 
     signal: NDArray[np.float32]
     filtered: NDArray[np.float32]
     words: NDArray[np.uint64]
     marks: NDArray[np.uint8]
+    at: NDArray[np.int32]
 
 
 class Found(NamedTuple):
@@ -90,13 +98,13 @@ class Found(NamedTuple):
     reason: NDArray[np.uint8]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
 def source_row(width: int) -> SourceRow:
     """Return scratch for rows of ``width`` pixels."""
     words = np.zeros((width + 7) // 8, np.uint64)
     return SourceRow(
-        np.zeros(width, np.float32), np.zeros(width, np.float32), words, words.view(np.uint8)
-    )
+        np.zeros(width, np.float32), np.zeros(width, np.float32),
+        words, words.view(np.uint8), np.zeros(width + 8, np.int32),
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -154,21 +162,35 @@ def bar_centres(signal: Any, out: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mark_crossings(filtered: Any, lit: Any, marks: Any) -> None:
-    """1 where the signal changes sign between a pixel and the next, and either is lit."""
+def find_crossings(lit: Any, r: SourceRow, first: int, last: int) -> int:
+    """List where the signal changes sign between a pixel and the next, and either is lit.
+
+    Returns their number; only pixels ``first <= x < last`` are listed.
+    """
+    filtered, marks, words, at = r.filtered, r.marks, r.words, r.at
     n = filtered.size
     for x in range(n - 1):
         turn = (filtered[x] >= 0) != (filtered[x + 1] >= 0)
         marks[x] = np.uint8(turn) & (lit[x] | lit[x + 1])
-    marks[n - 1] = 0
+    for x in range(first):
+        marks[x] = 0
+    for x in range(last, n):
+        marks[x] = 0
+    found = 0
+    for word in range(words.size):
+        if words[word]:
+            for x in range(8 * word, 8 * word + 8):
+                at[found] = x
+                found += marks[x]
+    return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def cubic_zero(filtered: Any, x: int, fit: Any, offset: int) -> tuple[float, float]:
     """Zero of the fitted cubic between samples x and x + 1, and the slope there.
 
-    Secants from the two samples' fitted values; NaN where they do not lead to a zero in or next
-    to the interval.
+    Secants from the two samples' fitted values; where they do not lead to a zero next to the
+    interval the position is outside [-0.5, 1.5].
     """
     c0 = c1 = c2 = c3 = np.float32(0)
     for j in range(fit.shape[1]):
@@ -177,51 +199,42 @@ def cubic_zero(filtered: Any, x: int, fit: Any, offset: int) -> tuple[float, flo
         c1 += fit[1, j] * v
         c2 += fit[2, j] * v
         c3 += fit[3, j] * v
-    a, fa = np.float32(0), c0
-    b, fb = np.float32(1), c0 + c1 + c2 + c3
-    for _ in range(4):
-        if fb == fa:
-            break
-        t = b - fb * (b - a) / (fb - fa)
-        a, fa = b, fb
-        b = t
+    one = np.float32(1)
+    fb = c0 + c1 + c2 + c3
+    a, fa, b = np.float32(0), c0, one
+    for _ in range(SECANTS):
+        step = fb - fa
+        t = b - fb * (b - a) / (step if step != 0 else one)
+        a, fa, b = b, fb, t
         fb = c0 + t * (c1 + t * (c2 + t * c3))
-        if abs(fb) < np.float32(1e-6):
-            break
-    if not -0.5 <= b <= 1.5:
-        return np.nan, np.nan
-    return b, c1 + b * (2 * c2 + 3 * c3 * b)
+    return b, c1 + b * (c2 + c2 + np.float32(3) * c3 * b)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def light_fails(p: PixelRow, x: int, t: Tuning) -> int:
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def light_fails(light: Any, clipped: Any, x: int, t: Tuning) -> int:
     """Reason why the light under the edge between x and x + 1 does not do, or 0."""
     first, last = x - t.reach_px, x + 1 + t.reach_px
-    if first < 0 or last >= p.light.size:
+    if first < 0 or last >= light.size:
         return SHADOW  # the image ends
-    least = min(p.light[x], p.light[x + 1])
-    if max(p.light[first], p.light[last]) < t.contrast_dn and least < t.contrast_dn:
+    left, right = light[first], light[last]
+    least = min(light[x], light[x + 1])
+    sides, most = min(left, right), max(left, right)
+    if max(most, least) < t.contrast_dn:
         return CONTRAST
-    clipped = 0
-    for i in range(first, last + 1):
-        clipped |= p.clipped[i]
-        least = min(least, p.light[i])
-    if clipped:
+    if clipped[first] | clipped[x] | clipped[x + 1] | clipped[last]:
         return SATURATION
-    sides = min(p.light[first], p.light[last])
-    most = max(p.light[first], p.light[last])
-    if least < t.min_light * most or least < 0.6 * sides:
+    if min(least, sides) < t.min_light * most or least < DIP * sides:
         return SHADOW
-    return CONTRAST if least < t.contrast_dn else 0
+    return CONTRAST if min(least, sides) < t.contrast_dn else 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def nearest(middle: float, residue: int, period: int) -> int:
     """Integer next to ``middle`` that is ``residue`` modulo ``period``."""
-    return residue + period * int(np.floor((middle - residue) / period + 0.5))
+    return residue + period * int(np.floor((middle - residue) * (1.0 / period) + 0.5))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def boundary_of(
     code: Any, x: int, rising: bool, rising_px: int, half: int, t: Tuning
 ) -> tuple[int, bool]:
@@ -245,29 +258,31 @@ def boundary_of(
     return (k, agreed) if 0 < k < t.size_px else (0, False)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def pair_variance(total: float, gain: Any, plateau: float, t: Tuning) -> float:
-    """Variance of the filtered signal of a pair; total = P + N at the edge, DN.
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def pair_variance(total: float, gain: Any, i: int, plateau: float, t: Tuning) -> float:
+    """Variance of a pair's filtered signal times total^2, DN^2; total = P + N at the edge.
 
     var((P - N)/(P + N)) = [2 a (1 + q^2) + b S (1 - q^2)] / S^2 for pixel noise a + b * level.
     """
-    q2 = gain[1] * plateau * plateau
-    shot = t.noise_dn * total * (gain[0] - q2)
-    return (2 * t.noise_dn2 * (gain[0] + q2) + shot) / (total * total)
+    q2 = gain[i, 1] * plateau * plateau
+    return 2 * t.noise_dn2 * (gain[i, 0] + q2) + t.noise_dn * total * (gain[i, 0] - q2)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def single_variance(p: PixelRow, x: int, gain: Any, level_dn: float, t: Tuning) -> float:
-    """Variance of the filtered signal of a single image whose samples lie about ``level_dn``."""
-    light = p.light[x]
-    bright, dark = max(1, p.bright[x]), max(1, p.dark[x])
-    high = t.noise_dn2 + t.noise_dn * (p.threshold[x] + 0.5 * light)
-    low = t.noise_dn2 + t.noise_dn * (p.threshold[x] - 0.5 * light)
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def single_variance(
+    threshold_dn: float, light_dn: float, bright: int, dark: int, level_dn: float, t: Tuning
+) -> float:
+    """Variance of a single image's samples about ``level_dn``, and of their threshold, DN^2.
+
+    The threshold is the middle between the means of so many bright and dark samples.
+    """
+    high = t.noise_dn2 + t.noise_dn * (threshold_dn + 0.5 * light_dn)
+    low = t.noise_dn2 + t.noise_dn * (threshold_dn - 0.5 * light_dn)
     own = t.noise_dn2 + t.noise_dn * level_dn
-    return gain[0] * (own + 0.25 * (high / bright + low / dark)) / (light * light)
+    return own + 0.25 * (high * dark + low * bright) / (bright * dark)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def noise_gain(table: Any, fraction: float) -> Any:
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def phase_of(fraction: float) -> int:
     """Row of the gain table for a sub-pixel phase."""
-    return table[min(PHASES, max(0, int(fraction * PHASES + 0.5)))]
+    return min(PHASES, max(0, int(fraction * PHASES + 0.5)))

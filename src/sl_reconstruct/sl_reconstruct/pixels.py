@@ -12,8 +12,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-#: Samples that a dynamic threshold may be carried to where a pixel saw only bright or only dark.
+#: Distance over which a threshold is carried to pixels that saw only bright or only dark.
 CARRY_PX = 16
+#: Clean samples that go into a threshold; their count must fit above the sum.
+MAX_SAMPLES = 15
+COUNT_SHIFT_8, COUNT_SHIFT_16 = 12, 20
 
 
 class PixelRow(NamedTuple):
@@ -22,9 +25,9 @@ class PixelRow(NamedTuple):
     ``low``, ``high``: dark and bright level (or darkest and brightest sample), stack type.
     ``middle``: integer threshold between them. ``light``: bright minus dark, DN.
     ``threshold``: sub-DN threshold, NaN where unknown (dynamic only). ``bright``, ``dark``:
-    number of clean samples (dynamic only). ``bright_sum``, ``dark_sum``: their sums.
-    ``bit``, ``parity``: a bit plane and the running parity. ``code``: division number.
-    ``flat``: 1 where lit; ``clipped``: 1 where some wanted sample saturates.
+    clean samples (dynamic only), their sum in the low bits and their count above.
+    ``bit``, ``clean``, ``parity``: a bit plane, where it is far from its edges, and the running
+    parity. ``code``: division number. ``lit``: 1 where lit; ``clipped``: 1 where saturated.
     """
 
     low: NDArray[Any]
@@ -32,28 +35,22 @@ class PixelRow(NamedTuple):
     middle: NDArray[Any]
     light: NDArray[np.float32]
     threshold: NDArray[np.float32]
-    bright: NDArray[np.uint8]
-    dark: NDArray[np.uint8]
-    bright_sum: NDArray[Any]
-    dark_sum: NDArray[Any]
+    bright: NDArray[Any]
+    dark: NDArray[Any]
     bit: NDArray[np.uint8]
+    clean: NDArray[np.uint8]
     parity: NDArray[np.uint8]
     code: NDArray[np.uint16]
     lit: NDArray[np.uint8]
     clipped: NDArray[np.uint8]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def pixel_row(width: int, like: NDArray[Any], sums: NDArray[Any]) -> PixelRow:
-    """Return scratch for rows of ``width`` pixels; ``like`` and ``sums`` give the types."""
-    return PixelRow(
-        np.zeros(width, like.dtype), np.zeros(width, like.dtype), np.zeros(width, like.dtype),
-        np.zeros(width, np.float32), np.zeros(width, np.float32),
-        np.zeros(width, np.uint8), np.zeros(width, np.uint8),
-        np.zeros(width, sums.dtype), np.zeros(width, sums.dtype),
-        np.zeros(width, np.uint8), np.zeros(width, np.uint8), np.zeros(width, np.uint16),
-        np.zeros(width, np.uint8), np.zeros(width, np.uint8),
-    )  # fmt: skip
+def pixel_row(width: int, dtype: Any) -> PixelRow:
+    """Return scratch for rows of ``width`` pixels of a stack of type ``dtype``."""
+    sums = np.uint16 if dtype == np.uint8 else np.uint32
+    types = [dtype, dtype, dtype, np.float32, np.float32, sums, sums, np.uint8, np.uint8]
+    types += [np.uint8, np.uint16, np.uint8, np.uint8]
+    return PixelRow(*(np.zeros(width, t) for t in types))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -107,23 +104,29 @@ def set_code(stack: Any, y: int, bits: Any, p: PixelRow) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_clean(row: Any, p: PixelRow, reach: int) -> None:
-    """Add one image to the sums where no edge of it lies within ``reach`` pixels."""
-    bit, middle = p.bit, p.middle
-    n = row.size
-    for x in range(n):
-        bit[x] = np.uint8(row[x] > middle[x])
-    left, right = bit[: n - 2 * reach], bit[2 * reach :]
-    mid, values = bit[reach : n - reach], row[reach : n - reach]
-    bright, dark = p.bright[reach : n - reach], p.dark[reach : n - reach]
-    bright_sum, dark_sum = p.bright_sum[reach : n - reach], p.dark_sum[reach : n - reach]
-    for x in range(n - 2 * reach):
-        b = left[x] & mid[x] & right[x]
-        d = (left[x] | mid[x] | right[x]) ^ np.uint8(1)
-        bright[x] += b
-        dark[x] += d
-        bright_sum[x] += values[x] * b
-        dark_sum[x] += values[x] * d
+def _find_clean(bit: Any, reach: int, clean: Any) -> None:
+    """2 where bright and 0 where dark with no edge within ``reach`` pixels, else 1."""
+    n = bit.size
+    left, mid, right = bit[: n - 2 * reach], bit[reach : n - reach], bit[2 * reach :]
+    inner = clean[reach : n - reach]
+    for x in range(inner.size):
+        inner[x] = (left[x] & mid[x] & right[x]) + (left[x] | mid[x] | right[x])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add(row: Any, clean: Any, wanted: int, shift: int, sums: Any) -> None:
+    """Add sample and count where ``clean`` is ``wanted``."""
+    for x in range(row.size):
+        take = np.uint8(clean[x] == wanted)
+        sums[x] = sums[x] + (row[x] + (1 << shift)) * take
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mean(sums: Any, shift: int, out: Any) -> None:
+    """Mean of the summed samples; NaN where there are none."""
+    for x in range(out.size):
+        count = sums[x] >> shift
+        out[x] = np.float32(sums[x] & ((1 << shift) - 1)) / np.float32(count)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -149,24 +152,40 @@ def set_threshold(stack: Any, y: int, images: Any, reach: int, p: PixelRow) -> N
     The mean of the bright and the mean of the dark samples of the pixel, without samples near an
     edge of their image: means have no noise bias, as extremes have.
     """
-    for x in range(p.bright.size):
-        p.bright[x] = 0
-        p.dark[x] = 0
-        p.bright_sum[x] = 0
-        p.dark_sum[x] = 0
-    for j in range(images.size):
-        _add_clean(stack[images[j], y], p, reach)
+    bright, dark, bit, middle, clean = p.bright, p.dark, p.bit, p.middle, p.clean
+    shift = COUNT_SHIFT_8 if bright.itemsize == 2 else COUNT_SHIFT_16
+    for x in range(bright.size):
+        bright[x] = 0
+        dark[x] = 0
+        clean[x] = 1
+    for j in range(min(images.size, MAX_SAMPLES)):
+        row = stack[images[j], y]
+        for x in range(bit.size):
+            bit[x] = np.uint8(row[x] > middle[x])
+        _find_clean(bit, reach, clean)
+        _add(row, clean, 2, shift, bright)
+        _add(row, clean, 0, shift, dark)
+    _mean(bright, shift, p.light)
+    _mean(dark, shift, p.threshold)
     missing = 0
-    threshold, light, bright, dark = p.threshold, p.light, p.bright, p.dark
+    threshold, light = p.threshold, p.light
     for x in range(threshold.size):
-        b = np.float32(p.bright_sum[x]) / np.float32(bright[x])
-        d = np.float32(p.dark_sum[x]) / np.float32(dark[x])
-        known = (bright[x] > 0) & (dark[x] > 0)
-        threshold[x] = (b + d) * np.float32(0.5) if known else np.float32(np.nan)
-        light[x] = b - d if known else light[x]
-        missing += not known
+        b, d = light[x], threshold[x]
+        threshold[x] = (b + d) * np.float32(0.5)
+        light[x] = b - d
+        missing += np.isnan(b + d)
     if missing:
-        _carry(threshold, light)
+        _fill(p)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill(p: PixelRow) -> None:
+    """Where a pixel saw only bright or only dark: neighbours' threshold, plain contrast."""
+    light, high, low = p.light, p.high, p.low
+    for x in range(light.size):
+        if np.isnan(light[x]):
+            light[x] = np.float32(high[x]) - np.float32(low[x])
+    _carry(p.threshold, light)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -175,4 +194,12 @@ def set_masks(p: PixelRow, lit_dn: float, saturation: int) -> None:
     light, high, lit, clipped = p.light, p.high, p.lit, p.clipped
     for x in range(lit.size):
         lit[x] = np.uint8(light[x] >= np.float32(lit_dn))
+    for x in range(lit.size):
         clipped[x] = np.uint8(high[x] >= saturation)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def sample_count(sums: Any, x: int) -> int:
+    """Number of clean samples behind a pixel's sum, at least 1."""
+    shift = COUNT_SHIFT_8 if sums.itemsize == 2 else COUNT_SHIFT_16
+    return max(1, sums[x] >> shift)

@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sl_reconstruct.edges import PRESENT
-from sl_reconstruct.geometry import Geometry, Rays, camera_rays, point, ray_row, solve_slopes
+from sl_reconstruct.geometry import Geometry, Rays, camera_rays, solve_points, solve_slopes
 from sl_reconstruct.reasons import Reason
 
 STEP = int(Reason.STEP)
@@ -36,7 +36,7 @@ def _off(u: Any, before: Any, after: Any, limit: Any, bad: Any) -> None:
         bad[k] |= np.uint8(abs(d) > limit) | np.uint8(abs(e) > limit)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _side(u: Any, k: int, step: int) -> tuple[float, bool]:
     """Where the next two present boundaries on a side lead, and whether there are two."""
     first = -1
@@ -87,47 +87,39 @@ def find_steps(u_px: Any, y: int, limit: float, bad: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _put(g: Geometry, k: int, r: Rays, sigma_px: float, level: float, value: Any) -> bool:
-    x, y, z, dz_du, depth = point(g, k, r)
-    if not depth > 0:
-        return False
-    value[0] = x
-    value[1] = y
-    value[2] = z
-    value[3] = level
-    value[4] = abs(dz_du) * sigma_px
-    return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _row(
     g: Geometry, y: int, columns: Any, lines: Any, bad: Any, r: Rays, out: Output
 ) -> None:
     u, reason, values = out.u_px[y], out.reason[y], out.values[y]
+    found, sigma_px, level = lines.reason[y], lines.sigma_px[y], lines.level_dn[y]
     for k in range(u.size):
         u[k] = np.float32(np.nan) if bad[k] else lines.u_px[y, k]
-        code = lines.reason[y, k]
-        reason[k] = np.uint8(STEP) if bad[k] and code == PRESENT else code
+        reason[k] = np.uint8(STEP) if bad[k] and found[k] == PRESENT else found[k]
     camera_rays(g, u, float(y), r)
     solve_slopes(g, columns, r)
+    solve_points(g, r)
+    nan = np.float32(np.nan)
     for k in range(u.size):
+        if reason[k] == PRESENT and r.depth[k] > 0:
+            values[k, 0] = r.px[k]
+            values[k, 1] = r.py[k]
+            values[k, 2] = r.pz[k]
+            values[k, 3] = level[k]
+            values[k, 4] = abs(r.dz[k]) * sigma_px[k]
+            continue
         if reason[k] == PRESENT:
-            if _put(g, k, r, lines.sigma_px[y, k], lines.level_dn[y, k], values[k]):
-                continue
             reason[k] = GEOMETRY
-            u[k] = np.nan
+            u[k] = nan
         for i in range(5):
-            values[k, i] = np.nan
+            values[k, i] = nan
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def triangulate_rows(
-    first: int, last: int, g: Geometry, columns: Any, lines: Any, limit: float, out: Output
-) -> None:
+    first: int, last: int, g: Geometry, columns: Any, lines: Any, limit: float, out: Output,
+    r: Rays, bad: Any,
+) -> None:  # fmt: skip
     """Screen and triangulate rows first to last. columns: observed DMD column of each boundary."""
-    n = lines.u_px.shape[1]
-    bad = np.zeros(n, np.uint8)
-    r = ray_row(n)
     for y in range(first, last):
         find_steps(lines.u_px, y, limit, bad)
         _row(g, y, columns, lines, bad, r, out)

@@ -13,14 +13,14 @@ from sl_projector.sequence import PatternSequence
 from sl_reconstruct.cloud import CLOUD_DTYPE, Cloud, Figures, count_reasons
 from sl_reconstruct.edges import SQRT_2PI, Filter, Tuning
 from sl_reconstruct.filters import bar_slope, edge_filter, gaussian_taps, tap_variance
-from sl_reconstruct.geometry import geometry
+from sl_reconstruct.geometry import geometry, ray_row
 from sl_reconstruct.plan import AxisPlan, DecodePlan
 from sl_reconstruct.points import Output, triangulate_rows
 from sl_reconstruct.rig import Rig
-from sl_reconstruct.rows import Layout, Lines, decode_rows
+from sl_reconstruct.rows import Layout, Lines, decode_rows, row_scratch
 from sl_reconstruct.settings import Settings
 from sl_reconstruct.workers import share_rows
-from sl_reconstruct.survey import Noise, code_growth, fit_noise, sample_scatter, survey_rows
+from sl_reconstruct.survey import NOISE_STEP, Noise, code_growth, fit_noise, sample_scatter, survey_rows
 
 #: Blur assumed until it is measured, camera pixels.
 FIRST_BLUR_PX = 1.0
@@ -120,21 +120,29 @@ class Reconstructor:
         )
         columns = np.arange(boundaries) - 0.5
         limit = self.settings.max_jump_px
-        share_rows(
-            lambda a, b: triangulate_rows(a, b, self._geometry, columns, lines, limit, out), height
-        )
+
+        def work(first: int, last: int) -> None:
+            scratch = ray_row(boundaries), np.zeros(boundaries, np.uint8)
+            triangulate_rows(first, last, self._geometry, columns, lines, limit, out, *scratch)
+
+        share_rows(work, height)
         refused, lit = count_reasons(out.reason)
         return Cloud(points, out.u_px, out.reason, refused, lit, figures)
 
     def _decode(self, stack: NDArray[Any], plan: AxisPlan) -> tuple[AxisState, Lines, Figures]:
-        layout = make_layout(plan, self.plan.white, self.plan.black, stack)
+        layout = make_layout(plan, self.plan.white, self.plan.black)
         ys = survey_rows(stack.shape[1])
         few = self._lines((ys.size, plan, "survey"))
         state = survey(stack, ys, plan, layout, self.settings, few)
         lines = self._lines((stack.shape[1], plan, "all"))
         rows = np.arange(stack.shape[1])
         arguments = (stack, layout, state.edge_filter, state.tuning, state.bar_slope, lines)
-        share_rows(lambda a, b: decode_rows(rows, a, b, *arguments), rows.size)
+
+        def work(first: int, last: int) -> None:
+            scratch = row_scratch(stack.shape[2], stack.dtype, -(-plan.size_px // plan.division_px))
+            decode_rows(rows, first, last, *arguments, scratch)
+
+        share_rows(work, rows.size)
         return state, lines, figures_of(state, lines, ys)
 
     def _lines(self, key: tuple[Any, ...]) -> Lines:
@@ -149,7 +157,7 @@ class Reconstructor:
         return self._scratch[key]
 
 
-def make_layout(plan: AxisPlan, white: int, black: int, stack: NDArray[Any]) -> Layout:
+def make_layout(plan: AxisPlan, white: int, black: int) -> Layout:
     """Write an axis's plan as arrays for the kernels."""
     k = np.arange(plan.size_px)
     edge_owner = np.full(plan.size_px, -1)
@@ -166,10 +174,9 @@ def make_layout(plan: AxisPlan, white: int, black: int, stack: NDArray[Any]) -> 
         for s in plan.sources
     ]
     bits = [(b.image, b.inverse, b.flipped) for b in plan.bits]
-    sums = np.zeros(1, np.uint16 if stack.dtype == np.uint8 else np.uint32)
     return Layout(
         np.array(sources, np.int64), edge_owner, centre_owner, np.array(bits, np.int64),
-        np.array(plan.images, np.int64), white, black, plan.dynamic, sums,
+        np.array(plan.images, np.int64), white, black, plan.dynamic,
     )  # fmt: skip
 
 
@@ -189,16 +196,17 @@ def survey(
 ) -> AxisState:  # fmt: skip
     """Measure direction, scale, noise and blur on a few rows, and choose the filters."""
     tuning = first_tuning(plan, settings, int(np.iinfo(stack.dtype).max))
-    growth, _ = code_growth(stack, ys, layout, tuning)
+    scratch = row_scratch(stack.shape[2], stack.dtype, -(-plan.size_px // plan.division_px))
+    growth, _ = code_growth(stack, ys, layout, tuning, scratch.pixels)
     if not abs(growth) > 0:
         growth = 1.0
-    noise = fit_noise(sample_scatter(stack, ys, layout, tuning))
+    noise = fit_noise(sample_scatter(stack, ys[::NOISE_STEP], layout, tuning, scratch.pixels))
     tuning = tuning._replace(
         direction=1 if growth > 0 else -1, scale=1 / abs(growth),
         noise_dn2=noise.read_dn2, noise_dn=noise.shot_dn,
     )  # fmt: skip
     first = edge_filter(plan, True, FIRST_BLUR_PX, tuning.scale)
-    decode_rows(ys, 0, ys.size, stack, layout, first, tuning, 0.0, few)
+    decode_rows(ys, 0, ys.size, stack, layout, first, tuning, 0.0, few, scratch)
     tuning = tuning._replace(scale=measure_scale(few, tuning.scale))
     blur_px = settings.edge_blur_px or measure_blur(few, plan, layout, tuning.scale)
     tuning = tuning._replace(

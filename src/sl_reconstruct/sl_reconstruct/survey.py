@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sl_reconstruct.edges import Tuning
-from sl_reconstruct.pixels import PixelRow, pixel_row
+from sl_reconstruct.pixels import PixelRow
 from sl_reconstruct.rows import Layout, decode_pixels
 
 #: Rows looked at, evenly spread over the image.
@@ -17,6 +17,8 @@ SURVEY_ROWS = 24
 #: Distance over which the code's growth is measured, camera pixels.
 LAG_PX = 32
 NOISE_BINS = 8
+#: Every so many surveyed rows the noise is measured.
+NOISE_STEP = 4
 #: Samples of one pixel must be at least so many before their scatter counts.
 MIN_SAMPLES = 4
 
@@ -40,9 +42,8 @@ def survey_rows(height: int) -> NDArray[np.int64]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def code_growth(stack: Any, ys: Any, plan: Layout, t: Tuning) -> Any:
+def code_growth(stack: Any, ys: Any, plan: Layout, t: Tuning, p: PixelRow) -> Any:
     """DMD pixels that the code grows by per camera pixel, mean over lit pixels, and their count."""
-    p = pixel_row(stack.shape[2], stack[0, 0], plan.sums)
     divisions = (t.size_px + t.division_px - 1) // t.division_px
     total, count = 0, 0
     for y in ys:
@@ -75,10 +76,9 @@ def _gather(stack: Any, y: int, plan: Layout, reach: int, p: PixelRow, sums: Any
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sample_scatter(stack: Any, ys: Any, plan: Layout, t: Tuning) -> Any:
+def sample_scatter(stack: Any, ys: Any, plan: Layout, t: Tuning, p: PixelRow) -> Any:
     """Mean, variance and count of clean samples, shape (rows, 2, width, 3); count 0 = none."""
     width = stack.shape[2]
-    p = pixel_row(width, stack[0, 0], plan.sums)
     out = np.zeros((ys.size, 2, width, 3))
     sums = np.zeros((2, width, 3))
     for i in range(ys.size):
