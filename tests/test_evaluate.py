@@ -221,6 +221,31 @@ def test_old_files_do_not_survive_a_refused_scan(
     assert [p.name for p in (tmp_path / "out" / "scan_0001").iterdir()] == ["report.json"]
 
 
+def test_old_scans_do_not_pass_for_new_ones(
+    tmp_path: Path, sequence: PatternSequence, frames: np.ndarray
+) -> None:
+    out = tmp_path / "out"
+    evaluate(record(tmp_path / "a", sequence, frames, scans=2, rig=tiny_rig()), out)
+    (out / "scan_0002" / "mine.txt").write_text("not slrig's")
+    evaluate(record(tmp_path / "b", sequence, frames, rig=tiny_rig()), out, "--no-pictures")
+    assert [p.name for p in (out / "scan_0002").iterdir()] == ["mine.txt"]
+    assert len(json.loads((out / "summary.json").read_text())["scans"]) == 1
+
+
+def test_an_unwritable_place_is_one_line(
+    tmp_path: Path,
+    sequence: PatternSequence,
+    frames: np.ndarray,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    bag = record(tmp_path / "bag", sequence, frames, rig=tiny_rig())
+    (tmp_path / "file").write_text("")
+    assert evaluate(bag, tmp_path / "file" / "out")[0] == 1
+    error = capsys.readouterr().err
+    assert error.startswith("slrig: error: ")
+    assert error.count("\n") == 1
+
+
 def test_no_calibration_is_refused(
     tmp_path: Path,
     sequence: PatternSequence,

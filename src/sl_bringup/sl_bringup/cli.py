@@ -72,6 +72,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
     except BrokenPipeError:
         return 1
+    except OSError as exc:  # a full disk, a folder that is not ours
+        complain(f"slrig: error: {exc}")
+        return 1
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ it uses: same data and settings, same bits.
 from __future__ import annotations
 
 import argparse
-import hashlib
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from importlib import metadata
@@ -22,12 +22,13 @@ from sl_bringup.bags import CALIBRATION, TRIGGER, Bag, open_bag, topic_names
 from sl_bringup.progress import Progress, complain, say
 from sl_bringup.replay import decisions
 from sl_bringup.report import page, verdict_line, write_json, write_page
-from sl_bringup.scan_files import write_scan
+from sl_bringup.scan_files import clear_scan, write_scan
 from sl_camera.matching import FrameDecision, MatchedStack, MatcherSettings, StackMatcher, Status
 from sl_projector.documents import write_text
 from sl_projector.errors import BagError, CalibrationError, ConfigError, SlError
 from sl_reconstruct.calibration_file import Calibration, load_calibration, parse_calibration
 from sl_reconstruct.cloud import Cloud
+from sl_reconstruct.cloud_files import cloud_hash
 from sl_reconstruct.settings import Settings
 from sl_reconstruct.workshop import Workshop
 
@@ -123,11 +124,6 @@ def _recorded_calibrations(bag: Bag) -> list[InForce]:
     return sorted(found, key=lambda c: c.received_ns)
 
 
-def cloud_hash(points: NDArray[Any]) -> str:
-    """sha256 of the cloud's points, 20 bytes each (x, y, z, intensity, sigma as float32)."""
-    return hashlib.sha256(np.ascontiguousarray(points).data.cast("B")).hexdigest()
-
-
 def evaluate_bag(path: Path, output: Path, choices: Choices) -> list[dict[str, Any]]:
     """Evaluate all scans of a recording and write their folders.
 
@@ -153,6 +149,7 @@ def evaluate_bag(path: Path, output: Path, choices: Choices) -> list[dict[str, A
         When no usable calibration is at hand.
     """
     with open_bag(path, choices.namespace) as bag:
+        _clear(output)
         total = _count_scans(bag)
         calibrations = Calibrations(bag, choices.calibration)
         matcher = StackMatcher(choices.matching)
@@ -170,6 +167,21 @@ def evaluate_bag(path: Path, output: Path, choices: Choices) -> list[dict[str, A
         if not reports:
             raise BagError(f"{path} holds no scan{_lost(bag)}; expected triggers and images")
     return reports
+
+
+def _clear(output: Path) -> None:
+    """Take away what an earlier evaluation wrote here, so that no old scan passes for a new one."""
+    summary = output / "summary.json"
+    if not summary.is_file():
+        return
+    try:
+        folders = [str(scan["folder"]) for scan in json.loads(summary.read_text())["scans"]]
+    except (ValueError, KeyError, TypeError):
+        raise ConfigError(f"{summary} is not of slrig; expected an empty or new folder") from None
+    for name in folders:
+        clear_scan(output / Path(name).name)
+    for name in ("summary.json", "index.html"):
+        (output / name).unlink(missing_ok=True)
 
 
 def _count_scans(bag: Bag) -> int:
@@ -387,8 +399,7 @@ def run(args: argparse.Namespace) -> int:
     reports = evaluate_bag(args.bag, args.output, choices)
     for report in reports:
         say(_line(report))
-    summary = args.output / "summary.json"
-    lost = yaml.safe_load(summary.read_text())["lost"]
+    lost = json.loads((args.output / "summary.json").read_text())["lost"]
     for line in lost:
         complain(f"slrig: lost: {line}")
     say(f"results in {args.output}")

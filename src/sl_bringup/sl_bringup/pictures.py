@@ -54,7 +54,10 @@ def relief_picture(height: HeightMap, title: str) -> bytes:
     shade = LightSource(azdeg=315, altdeg=45).hillshade(
         filled, vert_exag=exaggeration, dx=height.step_m, dy=height.step_m
     )
-    figure, axes = _map_axes(height, f"{title}\nheights {exaggeration:.3g} times exaggerated")
+    figure, axes = _map_axes(
+        height,
+        f"{title}\nrelief, heights {exaggeration:.3g} times exaggerated (tinted: not measured)",
+    )
     axes.set_facecolor(ABSENT_COLOUR)
     axes.imshow(
         np.where(there, shade, np.nan), cmap="gray", vmin=0, vmax=1, extent=_extent_mm(height)
@@ -164,7 +167,8 @@ def _map(
         high = max(abs(low), abs(high))
         low = -high
     unit, factor = _unit(np.array([low, high]))
-    figure, axes = _map_axes(height, title)
+    missing = "" if np.isfinite(values_m).all() else " (grey: not measured)"
+    figure, axes = _map_axes(height, title + missing)
     axes.set_facecolor(MISSING_COLOUR)
     image = axes.imshow(
         values_m * factor, cmap=colours, vmin=low * factor, vmax=high * factor,
@@ -219,5 +223,5 @@ def _broken_at_gaps(x: NDArray[Any], *values: NDArray[Any]) -> tuple[NDArray[Any
 def _png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     FigureCanvasAgg(figure)
-    figure.savefig(buffer, format="png")
+    figure.savefig(buffer, format="png", pil_kwargs={"compress_level": 4})
     return buffer.getvalue()

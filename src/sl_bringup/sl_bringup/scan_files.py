@@ -44,9 +44,8 @@ def write_scan(
     dict
         PNG pictures by caption.
     """
+    clear_scan(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    for name in [*FILES, *(f"{picture}.png" for picture in PICTURES)]:
-        (folder / name).unlink(missing_ok=True)
     if cloud is None:
         return {}
     notes = {key: report[key] for key in ("calibration_hash", "settings_hash", "cloud_hash")}
@@ -61,6 +60,14 @@ def write_scan(
         with written_atomically(folder / f"{name}.png") as partial:
             partial.write_bytes(png)
     return dict(drawn.values())
+
+
+def clear_scan(folder: Path) -> None:
+    """Delete the files that an earlier evaluation wrote into a scan's folder, and no others."""
+    for name in [*FILES, *(f"{picture}.png" for picture in PICTURES)]:
+        (folder / name).unlink(missing_ok=True)
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def _best_plane(cloud: Cloud, report: dict[str, Any]) -> Plane | None:

@@ -6,6 +6,7 @@ there is no point: one row per camera row, one column per DMD column boundary.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,11 @@ from numpy.typing import NDArray
 from sl_projector.documents import written_atomically
 
 POINT_FIELDS = ("x", "y", "z", "intensity", "sigma")
+
+
+def cloud_hash(points: NDArray[Any]) -> str:
+    """Hexadecimal sha256 of an organised cloud's bytes: equal clouds, and only they, share it."""
+    return hashlib.sha256(np.ascontiguousarray(points).data.cast("B")).hexdigest()
 
 
 def present(points: NDArray[Any]) -> NDArray[Any]:
