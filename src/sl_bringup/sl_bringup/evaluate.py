@@ -371,10 +371,10 @@ def add_parser(subparsers: Any) -> None:
         "cloud.pcd, height.tiff, height.png, report.json, report.html and pictures. The exit "
         "status is 0 only when every scan is complete and good.",
         epilog="examples:\n"
-        "  slrig evaluate scan.bag --output results\n"
-        "  slrig evaluate board.bag --calibration calibration.json --output results\n"
-        "  slrig evaluate scan.bag --output cubic --set estimator=cubic\n"
-        "  slrig evaluate foreign.bag --output results --set require_pose=false",
+        "  slrig evaluate scan_bag --output results\n"
+        "  slrig evaluate board_bag --calibration calibration.json --output results\n"
+        "  slrig evaluate scan_bag --output cubic --set estimator=cubic\n"
+        "  slrig evaluate foreign_bag --output results --set require_pose=false",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 directory, .mcap or .db3")

@@ -211,8 +211,8 @@ def add_parser(subparsers: Any) -> None:
         description="Make a rosbag2 recording of a folder of images, in natural order of their "
         "names, one per pattern. A folder with sub-folders is several scans.",
         epilog="examples:\n"
-        "  slrig import shots --sequence precise --output shots.bag\n"
-        "  slrig import board --sequence examples/procam_board.yaml --output board.bag "
+        "  slrig import shots --sequence precise --output shots_bag\n"
+        "  slrig import board --sequence examples/procam_board.yaml --output board_bag "
         "--calibration calibration.json",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
