@@ -80,5 +80,5 @@ def coin_heights(height_m: float, flank_m: float) -> tuple[Array, float]:
     for a, b in _placed_segments():
         _draw_segment(depth, axis, a, b, STROKE_M / 2 + flank_m)
     s = np.clip(depth / flank_m + 0.5, 0.0, 1.0)
-    dome = DOME_HEIGHT * np.cos(np.clip(radius / DOME_RADIUS_M, 0.0, 1.0) * np.pi / 2) ** 2
+    dome = DOME_HEIGHT * np.sin(np.clip(1.0 - radius / DOME_RADIUS_M, 0.0, 1.0) * np.pi / 2) ** 2
     return height_m * np.maximum(s * s * (3 - 2 * s), dome), STEP_M

@@ -155,21 +155,47 @@ class GridSurface(Surface):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _gap(data, p, x, y):  # type: ignore[no-untyped-def]
+    h, _, _ = raycast.height_gradient(data, x, y)
+    return np.sqrt((p[0] - x) ** 2 + (p[1] - y) ** 2 + (p[2] - h) ** 2)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nearest_start(data, p):  # type: ignore[no-untyped-def]
+    """Nearest of 21 x 21 feet around a point: the true foot is no further off than |z - h|."""
+    best_x, best_y, best = p[0], p[1], _gap(data, p, p[0], p[1])
+    reach = best
+    if reach < 0.25 * data.params[0]:  # within a cell: the tangent plane will do
+        return best_x, best_y, best
+    for j in range(-10, 11):
+        for i in range(-10, 11):
+            x, y = p[0] + 0.1 * i * reach, p[1] + 0.1 * j * reach
+            d = _gap(data, p, x, y)
+            if d < best:
+                best_x, best_y, best = x, y, d
+    return best_x, best_y, best
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _grid_distances(data, points):  # type: ignore[no-untyped-def]
-    """Distance to the foot on the tangent plane, the foot found again until it stays."""
+    """Distance to the start's foot, moved along tangent planes, by ever smaller steps."""
     out = np.empty(points.shape[0])
-    for i in range(points.shape[0]):
-        px, py, pz = points[i]
-        x, y, best = px, py, np.inf
-        for _ in range(12):
+    for k in range(points.shape[0]):
+        p = points[k]
+        x, y, best = _nearest_start(data, p)
+        share = 1.0
+        while share > 1e-3:
             h, hx, hy = raycast.height_gradient(data, x, y)
-            d = np.sqrt((px - x) ** 2 + (py - y) ** 2 + (pz - h) ** 2)
-            if not d < best:
-                break
-            best = d
-            off = (pz - h - hx * (px - x) - hy * (py - y)) / (1.0 + hx * hx + hy * hy)
-            x, y = px + hx * off, py + hy * off
-        out[i] = best if np.isfinite(px + py + pz) else np.nan
+            off = (p[2] - h - hx * (p[0] - x) - hy * (p[1] - y)) / (1.0 + hx * hx + hy * hy)
+            new_x = x + share * (p[0] + hx * off - x)
+            new_y = y + share * (p[1] + hy * off - y)
+            d = _gap(data, p, new_x, new_y)
+            gain = best - d
+            if gain > 0.0:
+                x, y, best = new_x, new_y, d
+            if not gain > 1e-12:
+                share *= 0.5
+        out[k] = best
     return out
 
 

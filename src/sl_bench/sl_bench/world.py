@@ -105,6 +105,7 @@ class World:
         self._render_lock = threading.Lock()
         self._frames: OrderedDict[tuple[object, ...], Image] = OrderedDict()
         self._geometry: tuple[object, Geometry] | None = None
+        self._maps: tuple[Image, ...] | None = None
         self._weights = stripes.lens_weights(self.optics.lens_blur_px)
         self._scene = Scene(surface, _finish(finish), np.eye(3), np.zeros(3), 0)
 
@@ -227,7 +228,7 @@ class World:
     def _traced(self, scene: Scene) -> Geometry:
         """Geometry of a scene; the last one is kept."""
         if self._geometry is None or self._geometry[0] != scene.key:
-            self._geometry = None  # frees the maps before their successors are made
+            self._geometry = None  # its maps are about to be written over
             self._geometry = (scene.key, self._trace(scene))
         return self._geometry[1]
 
@@ -237,7 +238,9 @@ class World:
         parts = (*self._data(scene), light, margin)
         width, height = self.rig.camera.image_size
         shape = (2 * (height + 2 * margin), 2 * (width + 2 * margin))
-        maps = tuple(np.empty(shape, dtype=np.float32) for _ in range(6))
+        if self._maps is None:  # 31 MB each: fresh pages at every pose would cost a third of it
+            self._maps = tuple(np.empty(shape, dtype=np.float32) for _ in range(6))
+        maps = self._maps
         in_strips(lambda r: shading.trace_rows(*parts, r, maps), shape[0])
         u, v, lit, ambient, along_u, along_v = maps
         plain = np.empty((height, width), dtype=np.float32)
