@@ -55,12 +55,13 @@ class Tuning(NamedTuple):
     """What survey and settings say, in pixels, DMD pixels and DN.
 
     ``direction``: +1 where k grows with u, -1 where it falls. ``reach_px``: beyond it an edge's
-    blur does not matter. ``scale``: camera pixels per DMD pixel. ``floor_dn``: keeps quotients
+    blur does not matter. ``around_px``: a fine stripe's half width. ``scale``: camera pixels per DMD pixel. ``floor_dn``: keeps quotients
     finite. ``noise_dn2``, ``noise_dn``: variance = noise_dn2 + noise_dn * level.
     """
 
     direction: int
     reach_px: int
+    around_px: int
     scale: float
     division_px: int
     size_px: int

@@ -14,7 +14,7 @@ MAX_RADIUS_PX = 12
 #: A kernel wider than this part of a stripe would mix neighbouring edges.
 STRIPE_PART = 0.22
 #: Samples of the paper's cubic fit on either side of the crossing.
-CUBIC_HALF = 3
+CUBIC_HALF = 2
 
 Array = NDArray[np.float64]
 

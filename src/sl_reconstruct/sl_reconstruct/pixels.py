@@ -26,7 +26,7 @@ class PixelRow(NamedTuple):
     ``middle``: integer threshold between them. ``light``: bright minus dark, DN.
     ``threshold``: sub-DN threshold, NaN where unknown (dynamic only). ``bright``, ``dark``:
     clean samples (dynamic only), their sum in the low bits and their count above.
-    ``bit``, ``clean``, ``parity``: a bit plane, where it is far from its edges, and the running
+    ``ratio``: dark over bright level. ``bit``, ``clean``, ``parity``: a bit plane, where it is far from its edges, and the running
     parity. ``code``: division number. ``lit``: 1 where lit; ``clipped``: 1 where saturated.
     """
 
@@ -35,6 +35,7 @@ class PixelRow(NamedTuple):
     middle: NDArray[Any]
     light: NDArray[np.float32]
     threshold: NDArray[np.float32]
+    ratio: NDArray[np.float32]
     bright: NDArray[Any]
     dark: NDArray[Any]
     bit: NDArray[np.uint8]
@@ -48,7 +49,7 @@ class PixelRow(NamedTuple):
 def pixel_row(width: int, dtype: Any) -> PixelRow:
     """Return scratch for rows of ``width`` pixels of a stack of type ``dtype``."""
     sums = np.uint16 if dtype == np.uint8 else np.uint32
-    types = [dtype, dtype, dtype, np.float32, np.float32, sums, sums, np.uint8, np.uint8]
+    types = [dtype, dtype, dtype, np.float32, np.float32, np.float32, sums, sums, np.uint8, np.uint8]
     types += [np.uint8, np.uint16, np.uint8, np.uint8]
     return PixelRow(*(np.zeros(width, t) for t in types))
 
@@ -130,19 +131,50 @@ def _mean(sums: Any, shift: int, out: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _carry(threshold: Any, light: Any) -> None:
-    """Carry thresholds to pixels that saw only bright or only dark, from the nearest on a side."""
-    n = threshold.size
-    last = -CARRY_PX - 1
-    for x in range(n):
-        if not np.isnan(threshold[x]):
-            gap = x - last
-            if 1 < gap <= CARRY_PX and last >= 0:
+def _carry(values: Any) -> None:
+    """Carry values into gaps of at most CARRY_PX, on a straight line between their ends."""
+    last = -1
+    for x in range(values.size):
+        if values[x] == values[x]:
+            if 1 < x - last <= CARRY_PX and last >= 0:
                 for i in range(last + 1, x):
-                    w = np.float32((i - last) / gap)
-                    threshold[i] = threshold[last] * (1 - w) + threshold[x] * w
-                    light[i] = light[last] * (1 - w) + light[x] * w
+                    w = np.float32((i - last) / (x - last))
+                    values[i] = values[last] * (1 - w) + values[x] * w
             last = x
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _least_around(values: Any, reach: int, out: Any) -> None:
+    """Minimum within about ``reach`` pixels on either side, in place; ``out`` is scratch."""
+    n, step, covered = values.size, 1, 0
+    while covered < reach:
+        left, mid, right = values[: n - 2 * step], values[step : n - step], values[2 * step :]
+        inner = out[step : n - step]
+        for x in range(n):
+            out[x] = values[x]
+        for x in range(inner.size):
+            a = left[x] if left[x] < mid[x] else mid[x]
+            inner[x] = right[x] if right[x] < a else a
+        for x in range(n):
+            values[x] = out[x]
+        covered += step
+        step = min(2 * step + 1, max(1, reach - covered))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def set_middle(around: int, p: PixelRow) -> None:
+    """Fill ``middle`` where every image of a pixel may be bright, as for some codes.
+
+    The ratio of dark to bright is that of ambient light and pattern, so it changes slowly,
+    whatever the albedo does: its least value nearby is used with the pixel's own bright level.
+    """
+    low, high, middle, ratio = p.low, p.high, p.middle, p.ratio
+    for x in range(low.size):
+        ratio[x] = np.float32(low[x]) / (np.float32(high[x]) + np.float32(1e-3))
+    _least_around(ratio, around, p.threshold)
+    half = np.float32(0.5)
+    for x in range(low.size):
+        middle[x] = np.int32(np.float32(high[x]) * (half + half * ratio[x]))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -168,24 +200,29 @@ def set_threshold(stack: Any, y: int, images: Any, reach: int, p: PixelRow) -> N
     _mean(bright, shift, p.light)
     _mean(dark, shift, p.threshold)
     missing = 0
-    threshold, light = p.threshold, p.light
+    threshold, light, ratio = p.threshold, p.light, p.ratio
+    for x in range(threshold.size):
+        b, d = light[x], threshold[x]
+        ratio[x] = d / b
+        missing += np.isnan(d)
+    if missing:
+        _carry(ratio)
+        for x in range(threshold.size):
+            threshold[x] = light[x] * ratio[x] if np.isnan(threshold[x]) else threshold[x]
     for x in range(threshold.size):
         b, d = light[x], threshold[x]
         threshold[x] = (b + d) * np.float32(0.5)
         light[x] = b - d
-        missing += np.isnan(b + d)
-    if missing:
-        _fill(p)
+    _fill_light(p)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill(p: PixelRow) -> None:
-    """Where a pixel saw only bright or only dark: neighbours' threshold, plain contrast."""
+def _fill_light(p: PixelRow) -> None:
+    """Plain contrast where a pixel was never clearly bright."""
     light, high, low = p.light, p.high, p.low
     for x in range(light.size):
-        if np.isnan(light[x]):
-            light[x] = np.float32(high[x]) - np.float32(low[x])
-    _carry(p.threshold, light)
+        plain = np.float32(high[x]) - np.float32(low[x])
+        light[x] = light[x] if light[x] == light[x] else plain
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -6,15 +6,14 @@ Everything the decoder knows about the patterns is derived here from the sequenc
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_projector.errors import SequenceError
 from sl_projector.sequence import Axis, Pattern, PatternSequence
 
-Feature = Literal["edge", "centre"]
+#: Light must be known so far on either side of an edge, DMD pixels.
+MARGIN_PX = 2
 
 
 @dataclass(frozen=True)
@@ -83,6 +82,9 @@ class AxisPlan:
         Every image that is constant or striped along this axis.
     sources : tuple of Source
         Where the boundaries come from.
+    unlit : tuple of int
+        Boundaries about which no image is bright, so that the full light there is not known to a
+        dynamic threshold (the code's first division).
     """
 
     axis: Axis
@@ -91,21 +93,33 @@ class AxisPlan:
     division_px: int
     images: tuple[int, ...]
     sources: tuple[Source, ...]
+    unlit: tuple[int, ...]
 
     @property
     def dynamic(self) -> bool:
         """Whether some source is a single image, which needs a threshold per pixel."""
         return any(not s.paired for s in self.sources)
 
+    def owners(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Source that gives each boundary by an edge, and by a centre; -1 where none does."""
+        k = np.arange(self.size_px)
+        edge, centre = np.full(self.size_px, -1), np.full(self.size_px, -1)
+        free = k > 0
+        known = ~np.isin(k, self.unlit)
+        for i, s in enumerate(self.sources):
+            mine = free & s.edge_at(k) & s.edges & (s.paired | known)
+            edge[mine] = i
+            free &= ~mine
+        for i, s in enumerate(self.sources):
+            mine = free & s.centre_at(k, self.size_px) & s.centres & known
+            centre[mine] = i
+            free &= ~mine
+        return edge, centre
+
     def boundaries(self) -> NDArray[np.bool_]:
         """Which boundaries some source can give, shape (size_px,)."""
-        k = np.arange(self.size_px)
-        out = np.zeros(self.size_px, bool)
-        for s in self.sources:
-            out |= s.edges & s.edge_at(k)
-            out |= s.centres & s.centre_at(k, self.size_px)
-        out[0] = False
-        return out
+        edge, centre = self.owners()
+        return np.asarray((edge >= 0) | (centre >= 0))
 
 
 @dataclass(frozen=True)
@@ -237,4 +251,15 @@ def _axis_plan(sequence: PatternSequence, axis: Axis) -> AxisPlan:
         i for i, p in enumerate(sequence.patterns) if p.kind != "gray" or p.axis == axis
     )
     sources = tuple(_sources(patterns, size_px))
-    return AxisPlan(axis, size_px, tuple(bits), division_px, images, sources)
+    unlit = _unlit([sequence.patterns[i] for i in images], size_px)
+    return AxisPlan(axis, size_px, tuple(bits), division_px, images, sources, unlit)
+
+
+def _unlit(patterns: list[Pattern], size_px: int) -> tuple[int, ...]:
+    """Boundaries with no image that is bright for ``MARGIN_PX`` on both sides."""
+    out = np.ones(size_px, bool)
+    for p in patterns:
+        padded = np.pad(p.profile(size_px), MARGIN_PX)
+        windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * MARGIN_PX)
+        out &= ~windows.all(axis=1)[:size_px]
+    return tuple(int(k) for k in np.flatnonzero(out))

@@ -159,16 +159,7 @@ class Reconstructor:
 
 def make_layout(plan: AxisPlan, white: int, black: int) -> Layout:
     """Write an axis's plan as arrays for the kernels."""
-    k = np.arange(plan.size_px)
-    edge_owner = np.full(plan.size_px, -1)
-    centre_owner = np.full(plan.size_px, -1)
-    for i, s in enumerate(plan.sources):
-        if s.edges:
-            edge_owner[s.edge_at(k) & (edge_owner < 0) & (k > 0)] = i
-    for i, s in enumerate(plan.sources):
-        if s.centres:
-            at = s.centre_at(k, plan.size_px) & (edge_owner < 0) & (centre_owner < 0)
-            centre_owner[at & (k > 0)] = i
+    edge_owner, centre_owner = plan.owners()
     sources = [
         (s.image, s.inverse, s.half_period_px, s.rising_px, s.edges, s.centres)
         for s in plan.sources
@@ -184,7 +175,7 @@ def first_tuning(plan: AxisPlan, settings: Settings, full_scale: int) -> Tuning:
     """What is known before a look at the images."""
     contrast_dn = settings.min_contrast_dn or 0.03 * full_scale
     return Tuning(
-        1, int(np.ceil(REACH_SD * FIRST_BLUR_PX)), 1.0, plan.division_px, plan.size_px,
+        1, int(np.ceil(REACH_SD * FIRST_BLUR_PX)), 4 * plan.division_px, 1.0, plan.division_px, plan.size_px,
         0.002 * full_scale, 0.5 * contrast_dn, contrast_dn,
         settings.saturation_dn or full_scale, 0.0, np.inf, settings.min_light, 0.0, 0.0,
     )  # fmt: skip
@@ -207,7 +198,9 @@ def survey(
     )  # fmt: skip
     first = edge_filter(plan, True, FIRST_BLUR_PX, tuning.scale)
     decode_rows(ys, 0, ys.size, stack, layout, first, tuning, 0.0, few, scratch)
-    tuning = tuning._replace(scale=measure_scale(few, tuning.scale))
+    scale = measure_scale(few, tuning.scale)
+    stripe_px = min(s.half_period_px for s in plan.sources) * scale
+    tuning = tuning._replace(scale=scale, around_px=max(3, int(np.ceil(stripe_px)) + 3))
     blur_px = settings.edge_blur_px or measure_blur(few, plan, layout, tuning.scale)
     tuning = tuning._replace(
         reach_px=max(2, int(np.ceil(REACH_SD * blur_px))),

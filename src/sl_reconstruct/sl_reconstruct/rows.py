@@ -40,6 +40,7 @@ from sl_reconstruct.pixels import (
     set_code,
     set_levels,
     set_masks,
+    set_middle,
     set_threshold,
 )
 from sl_reconstruct.reasons import Reason
@@ -84,6 +85,8 @@ class Lines(NamedTuple):
 def decode_pixels(stack: Any, y: int, plan: Layout, t: Tuning, p: PixelRow) -> None:
     """Fill everything that a row's pixels say by themselves."""
     set_levels(stack, y, plan.white, plan.black, plan.images, p)
+    if plan.dynamic:
+        set_middle(t.around_px, p)
     set_code(stack, y, plan.bits, p)
     if plan.dynamic:
         set_threshold(stack, y, plan.images, t.reach_px, p)
