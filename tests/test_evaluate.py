@@ -332,3 +332,21 @@ def test_assignments() -> None:
     for wrong in ("estimator", "speed=9", "estimator=best", "min_light=high", "timeout_s=-1"):
         with pytest.raises(ConfigError, match=re.escape(wrong.split("=")[0])):
             parse_choices([wrong])
+
+
+@needs_board
+def test_board_images_become_three_complete_scans(tmp_path: Path) -> None:
+    """Somebody else's images, sequence and lens model, without a line written for them."""
+    arguments = ["import", str(BOARD), "--sequence", str(EXAMPLE)]
+    assert main([*arguments, "--output", str(tmp_path / "bag")]) == 0
+    calibration = str(BOARD / "calibration.json")
+    _, reports = evaluate(
+        tmp_path / "bag", tmp_path / "out", "--calibration", calibration, "--no-pictures"
+    )
+    assert [r["scan_id"] for r in reports] == [1, 2, 3]
+    for report in reports:
+        assert report["complete"]
+        assert report["images"] == "42 of 1280 x 1024, mono8"
+        assert report["points"] > 200_000
+        # The board stands at 3.2 to 3.6 m (shared/data/README); the camera's frame is the world.
+        assert 3.0 < report["plane"]["point_m"][2] < 4.0

@@ -18,7 +18,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from sl_bringup.bags import CALIBRATION, TRIGGER, Bag, open_bag, topic_names
+from sl_bringup.bags import TRIGGER, Bag, open_bag, topic_names
+from sl_bringup.calibrations import Calibrations
 from sl_bringup.progress import Progress, complain, say
 from sl_bringup.replay import decisions
 from sl_bringup.report import page, verdict_line, write_json, write_page
@@ -26,11 +27,17 @@ from sl_bringup.scan_files import clear_scan, write_scan
 from sl_camera.matching import FrameDecision, MatchedStack, MatcherSettings, StackMatcher, Status
 from sl_projector.documents import write_text
 from sl_projector.errors import BagError, CalibrationError, ConfigError, SlError
-from sl_reconstruct.calibration_file import Calibration, load_calibration, parse_calibration
 from sl_reconstruct.cloud import Cloud
 from sl_reconstruct.cloud_files import cloud_hash
 from sl_reconstruct.settings import Settings
 from sl_reconstruct.workshop import Workshop
+
+#: Less than this part of the lit positions is no measurement of a surface.
+MIN_PRESENT = 0.2
+#: More than this part refused because the rays do not meet: the rig is another one.
+MAX_GEOMETRY = 0.1
+#: Residual of the four equations that a calibration may leave, pixels.
+MAX_MEDIAN_GAP_PX = 1.0
 
 VERDICTS = (Status.STACK_COMPLETE, Status.STACK_REFUSED)
 
@@ -58,70 +65,6 @@ class Choices:
     matching: MatcherSettings = field(default_factory=MatcherSettings)
     namespace: str | None = None
     pictures: bool = True
-
-
-@dataclass(frozen=True)
-class InForce:
-    """A calibration and where it comes from; ``received_ns`` is when it came into force."""
-
-    calibration: Calibration
-    source: str
-    received_ns: int = 0
-
-
-class Calibrations:
-    """Which calibration holds for a stack: the file that was named, else the bag's at the time.
-
-    Parameters
-    ----------
-    bag : Bag
-        The recording.
-    file : Path or None
-        Named by the user.
-
-    Raises
-    ------
-    CalibrationError
-        When there is none, or the bag's cannot be used.
-    """
-
-    def __init__(self, bag: Bag, file: Path | None) -> None:
-        self._file = file
-        self._read: dict[tuple[tuple[int, int], tuple[int, int]], InForce] = {}
-        self.recorded = [] if file else _recorded_calibrations(bag)
-        if file is None and not self.recorded:
-            raise CalibrationError(
-                f"{bag.path} holds no calibration and none is named; expected "
-                f"{bag.namespace}/{CALIBRATION.name} in the bag, or --calibration FILE"
-            )
-
-    def of(self, stack: MatchedStack) -> InForce:
-        """Calibration of a stack; a file may need the sizes that only the stack knows."""
-        if self._file is None:
-            start_ns = stack.image_stamps_ns[0]
-            known = [c for c in self.recorded if c.received_ns <= start_ns]
-            return known[-1] if known else self.recorded[0]
-        _, height, width = stack.data.shape
-        sizes = ((width, height), stack.sequence.dmd_size)
-        if sizes not in self._read:
-            found = load_calibration(self._file, *sizes)
-            self._read[sizes] = InForce(found, str(self._file))
-        return self._read[sizes]
-
-
-def _recorded_calibrations(bag: Bag) -> list[InForce]:
-    found = []
-    for recorded in bag.messages(CALIBRATION):
-        message = recorded.message
-        calibration = parse_calibration(message.yaml, f"{bag.path}: {CALIBRATION.name}")
-        if message.hash and message.hash != calibration.hash:
-            raise CalibrationError(
-                f"{bag.path}: the calibration in the bag says hash {message.hash[:12]}... but has "
-                f"{calibration.hash[:12]}..."
-            )
-        source = f"{bag.path.name} (recorded from {message.source or 'an unnamed source'})"
-        found.append(InForce(calibration, source, recorded.received_ns))
-    return sorted(found, key=lambda c: c.received_ns)
 
 
 def evaluate_bag(path: Path, output: Path, choices: Choices) -> list[dict[str, Any]]:
@@ -286,7 +229,32 @@ def _measure(
 
 
 def _faults(cloud: Cloud) -> list[str]:
-    return [] if cloud.present else ["no points"]
+    """Why a cloud is not good, in words; empty when it is.
+
+    Where the sequence has row patterns the fourth equation checks the calibration: rays that miss
+    each other by more than `MAX_MEDIAN_GAP_PX` come from a rig that is not the calibrated one.
+    """
+    if not cloud.present:
+        worst = max(cloud.refused, key=lambda name: cloud.refused[name])
+        return [f"no points: {cloud.lit} lit positions, refused mostly for {worst}"]
+    faults = []
+    if cloud.present < MIN_PRESENT * cloud.lit:
+        faults.append(
+            f"only {100 * cloud.present / cloud.lit:.1f} % of the lit positions gave a point; "
+            f"expected at least {100 * MIN_PRESENT:.0f} %"
+        )
+    if cloud.refused["geometry"] > MAX_GEOMETRY * cloud.lit:
+        faults.append(
+            f"at {100 * cloud.refused['geometry'] / cloud.lit:.1f} % of the lit positions the rays "
+            "of camera and projector do not meet; the calibration does not fit these images"
+        )
+    if cloud.gap_px is not None and not _median(cloud.gap_px) <= MAX_MEDIAN_GAP_PX:
+        faults.append(
+            f"the rays of camera and projector miss each other by {_median(cloud.gap_px):.3g} px "
+            f"(median); expected at most {MAX_MEDIAN_GAP_PX:g} px: the calibration does not fit "
+            "these images"
+        )
+    return faults
 
 
 def _figures(cloud: Cloud) -> dict[str, float]:
