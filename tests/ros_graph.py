@@ -61,7 +61,8 @@ class Graph:
         from rclpy.executors import SingleThreadedExecutor
 
         self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=next(_DOMAINS))
+        self.domain = next(_DOMAINS)
+        rclpy.init(context=self.context, domain_id=self.domain)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.tester = rclpy.create_node("tester", namespace="sl", context=self.context)
         self.executor.add_node(self.tester)

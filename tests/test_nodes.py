@@ -702,7 +702,7 @@ def test_a_graph_without_a_camera_says_so(tmp_path: Path) -> None:
     save_calibration(path, tiny_rig())
     with ros_graph.graph() as graph:
         graph.add(tiny_projector, FakeProjector)
-        graph.add(ReconstructNode, calibration_file=str(path))
+        graph.add(ReconstructNode, calibration_file=str(path), silence_timeout_s=1.0)
         answer = graph.call(Scan, "scan", Scan.Request())
         assert not answer.success
         assert "is the camera node running" in answer.message

@@ -40,7 +40,7 @@ class FakeGear:
     def stop_projecting(self) -> None:
         self.stopped = True
 
-    def missing(self) -> str:
+    def missing(self, patience_s: float) -> str:
         return self.lack
 
 

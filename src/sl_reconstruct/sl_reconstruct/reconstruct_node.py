@@ -386,14 +386,20 @@ class ReconstructNode(RigNode):
         self._watch = ScanWatch(self._last_id)
         return self._watch
 
-    def missing(self) -> str:
-        """Name what a scan cannot do without and nobody offers."""
-        if not self._project.wait_for_service(timeout_sec=3.0):
+    def missing(self, patience_s: float) -> str:
+        """Name what a scan cannot do without and nobody offers, even after a while."""
+        deadline_s = time.monotonic() + patience_s
+        while (gap := self._gap()) and time.monotonic() < deadline_s and self.context.ok():
+            time.sleep(0.05)
+        return gap
+
+    def _gap(self) -> str:
+        if not self._project.service_is_ready():
             return "nobody offers projector/project: is the projector node running?"
         for topic, node in (("camera/image_raw", "camera"), ("synchronizer/stack", "synchronizer")):
             if not self.count_publishers(topic):
                 return f"nobody publishes {topic}: is the {node} node running?"
-        if not self._workshop.calibration_hash and self._ready and not self._file:
+        if self._ready and not self._workshop.calibration_hash and not self._file:
             return "no calibration is in force: set the parameter calibration_file"
         return ""
 

@@ -166,8 +166,8 @@ class Gear(Protocol):
         """End a projection that nobody needs any more."""
         ...
 
-    def missing(self) -> str:
-        """Say which part of the graph is not there; empty when all are."""
+    def missing(self, patience_s: float) -> str:
+        """Say which part of the graph is still not there after a while; empty when all are."""
         ...
 
 
@@ -247,7 +247,7 @@ class ScanRun:
 
     def _once(self) -> Any:
         """One attempt: the node's report, or the reason why there is none."""
-        if gap := self._gear.missing():
+        if gap := self._gear.missing(self._timeouts.silence_s):
             raise ScanFailed(gap)
         watch = self._gear.begin()
         self._result.scan_id = watch.scan_id
@@ -303,7 +303,7 @@ class ScanRun:
             if self._cancelled():
                 raise ScanCancelled(f"scan {watch.scan_id} cancelled")
             if watch.silent_s() > timeout_s:
-                raise ScanFailed(f"{self._gear.missing() or lack} (waited {timeout_s:g} s)")
+                raise ScanFailed(f"{self._gear.missing(0.0) or lack} (waited {timeout_s:g} s)")
             self._report(stage, watch)
             watch.wait(done)
         self._report(stage, watch)
