@@ -211,6 +211,10 @@ class StageNode(RigNode):
             x, y, z = (a + b for a, b in zip(driver.position_m(), target_m, strict=True))
             target_m = (x, y, z)
         driver.limits_m().require_inside(target_m)
+        if request.check_only:
+            response.pose = self._pose(driver.position_m(), time.time_ns())
+            response.success, response.message = True, "within the travel"
+            return
         self._moves += 1
         try:
             driver.move_to(*target_m)
