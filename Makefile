@@ -38,7 +38,7 @@ bench: venv ## speed and memory
 	@set -e; for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b; done
 
 venv: ## everything installed into .venv
-	@$(MAKE) --no-print-directory -j 2 $(STAMPS)/installed
+	@$(MAKE) --no-print-directory -s -j 2 $(STAMPS)/installed
 
 clean: ## remove what was made, keep the environment
 	rm -rf build install log $(OUTPUT) .pytest_cache .mypy_cache .ruff_cache

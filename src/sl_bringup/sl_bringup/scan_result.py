@@ -124,6 +124,8 @@ def summary(report: Mapping[str, Any]) -> Iterator[str]:
         f"{report['processing_s']:.2f} s from the last image to the cloud, "
         f"{report['attempts']} attempt{'s' if report['attempts'] > 1 else ''}"
     )
+    for number, why in enumerate(report["attempt_messages"], start=1):
+        yield f"  attempt {number}       thrown away: {why}"
     yield from _groove_lines(report)
 
 

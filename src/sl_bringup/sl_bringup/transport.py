@@ -25,13 +25,15 @@ SHM_DIRECTORY = Path("/dev/shm")
 MAX_DOMAIN = 101
 
 #: Shared memory of a node that publishes large messages, bytes; all of it is taken at once.
-#: The camera's holds 17 frames of 1600 x 1200, the others two messages of `precise`.
-SEGMENT_BYTES = {"camera": 32 * MIB, "synchronizer": 96 * MIB, "reconstruct": 64 * MIB}
+#: The camera's holds 17 frames of 1600 x 1200, the others one message of `precise`; a larger one
+#: passes in turns.
+SEGMENT_BYTES = {"camera": 32 * MIB, "synchronizer": 64 * MIB, "reconstruct": 32 * MIB}
 #: Of all others, which publish small messages only.
 SMALL_SEGMENT_BYTES = 4 * MIB
-#: A message above is sent in pieces; it must not exceed the segment, else Fast DDS drops the
-#: shared memory without a word.
-MAX_PIECE_BYTES = 16 * MIB
+#: A message above is sent in pieces. At this size sender and receiver overlap: a stack of 48 MB
+#: takes 40 ms instead of 70 in pieces of 16 MB, and small segments do (``docs/transport.md``).
+#: It must not exceed the segment, else Fast DDS drops the shared memory without a word.
+MAX_PIECE_BYTES = MIB
 #: Less than this cannot carry frames; the shared memory is then left to Fast DDS' defaults.
 LEAST_SEGMENT_BYTES = 2 * MIB
 
