@@ -20,6 +20,8 @@ from sl_reconstruct.reasons import Reason
 
 #: Sub-pixel phases at which the noise gain of the estimator is tabulated.
 PHASES = 16
+#: Where a pattern's edges are far apart, the code beside an edge may be off by so many DMD px.
+MISREAD_PX = 6.0
 #: A narrow shadow under an edge leaves less than this part of the light beside it.
 DIP = 0.6
 #: Secant steps; the third is below 1e-6 px, as the filtered signal is nearly straight.
@@ -252,7 +254,7 @@ def boundary_of(
     turned = 0 if rising == (t.direction > 0) else 2 * half
     k = nearest(middle, rising_px + turned, 4 * half)
     span = (2 * t.reach_px + 1) / t.scale
-    near = abs(k - middle) <= 0.5 * t.division_px + 1.5
+    near = abs(k - middle) <= max(0.5 * t.division_px + 1.5, min(0.9 * half, MISREAD_PX))
     agreed = near and -t.division_px <= ahead <= 2.5 * span + t.division_px
     if not near:
         k = nearest(middle, rising_px, 2 * half)

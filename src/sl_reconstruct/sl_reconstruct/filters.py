@@ -101,10 +101,8 @@ def edge_filter(plan: AxisPlan, matched: bool, blur_px: float, scale: float) -> 
     radius = max(k.size for k in kernels)
     padded = np.array([np.pad(k, (0, radius - k.size)) for k in kernels])
     gain = [noise_gain(k, fit, offset, blur_px) for k in kernels] + [bar_gain(fit, offset)]
-    slope = [
-        stripe_slope(w, float(np.hypot(blur_px, np.sqrt(tap_variance(k)))))
-        for w, k in zip(stripes, kernels, strict=True)
-    ]
+    total = [float(np.sqrt(blur_px**2 + tap_variance(k))) for k in kernels]
+    slope = [stripe_slope(w, s) for w, s in zip(stripes, total, strict=True)]
     return Filter(
         padded.astype(np.float32), fit.astype(np.float32), offset,
         np.array(gain, np.float32), np.array(slope, np.float32),

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_projector.errors import StackError
 from sl_projector.sequence import PatternSequence
 from sl_reconstruct.cloud import CLOUD_DTYPE, Cloud, Figures, count_reasons
+from sl_reconstruct.crossed import Crossed, cross_rows, map_rows
 from sl_reconstruct.edges import SQRT_2PI, Filter, Tuning
 from sl_reconstruct.filters import bar_slope, edge_filter, gaussian_taps, tap_variance
 from sl_reconstruct.geometry import geometry, ray_row
 from sl_reconstruct.plan import AxisPlan, DecodePlan
 from sl_reconstruct.points import Output, triangulate_rows
+from sl_reconstruct.quality import check_identity, check_order, check_phase
 from sl_reconstruct.rig import Rig
 from sl_reconstruct.rows import Layout, Lines, decode_rows, row_scratch
 from sl_reconstruct.settings import Settings
@@ -26,6 +30,8 @@ from sl_reconstruct.survey import NOISE_STEP, Noise, code_growth, fit_noise, sam
 FIRST_BLUR_PX = 1.0
 #: An edge's blur does not matter beyond so many standard deviations.
 REACH_SD = 2.5
+#: A jump counts from so many standard deviations on.
+JUMP_SD = 6.0
 #: A usable BR8 needs this slope at a stripe's centre, per pixel of a unit stripe.
 MIN_BAR_SLOPE = 0.05
 
@@ -110,27 +116,49 @@ class Reconstructor:
             )
 
     def _reconstruct(self, stack: NDArray[Any]) -> Cloud:
-        state, lines, figures = self._decode(stack, self.plan.column)
-        height, boundaries = lines.u_px.shape
-        points = np.empty((height, boundaries), CLOUD_DTYPE)
-        out = Output(
-            points.view(np.float32).reshape(height, boundaries, 5),
-            np.empty((height, boundaries), np.float32),
-            np.empty((height, boundaries), np.uint8),
-        )
-        columns = np.arange(boundaries) - 0.5
-        limit = self.settings.max_jump_px
+        column = self.plan.column
+        state, lines, figures = self._decode(stack, column, self.plan.white, self.plan.black)
+        out = _output(*lines.u_px.shape)
+        columns = np.arange(column.size_px) - 0.5
+        limit = _jump_limit(self.settings, figures)
 
         def work(first: int, last: int) -> None:
-            scratch = ray_row(boundaries), np.zeros(boundaries, np.uint8)
+            scratch = ray_row(column.size_px), np.zeros(column.size_px, np.uint8)
             triangulate_rows(first, last, self._geometry, columns, lines, limit, out, *scratch)
 
-        share_rows(work, height)
+        share_rows(work, stack.shape[1])
+        crossed = self._cross(stack, lines, columns, out) if self.plan.row else None
         refused, lit = count_reasons(out.reason)
-        return Cloud(points, out.u_px, out.reason, refused, lit, figures)
+        extra = crossed[1:] if crossed else ()
+        points = out.values.view(CLOUD_DTYPE)[..., 0]
+        return Cloud(points, out.u_px, out.reason, refused, lit, figures, *extra)
 
-    def _decode(self, stack: NDArray[Any], plan: AxisPlan) -> tuple[AxisState, Lines, Figures]:
-        layout = make_layout(plan, self.plan.white, self.plan.black)
+    def _cross(
+        self, stack: NDArray[Any], lines: Lines, columns: NDArray[np.float64], out: Output
+    ) -> Crossed:
+        """Decode the rows, and solve again with all four equations."""
+        plan, white, black, turned = turn(self.plan, stack)
+        state, across, figures = self._decode(turned, plan, white, black)
+        t = state.tuning
+        sigma_v = float(np.nanmedian(across.sigma_px)) / t.scale
+        v_map = np.empty((stack.shape[2], stack.shape[1]), np.float32)
+        add = Crossed(v_map, *(np.empty_like(out.u_px) for _ in range(3)))
+        limit, gap_px = _jump_limit(self.settings, figures), self.settings.max_gap_px or np.inf
+
+        def work_rows(first: int, last: int) -> None:
+            map_rows(first, last, across, limit, v_map, np.zeros(plan.size_px, np.uint8))
+
+        def work(first: int, last: int) -> None:
+            cross_rows(first, last, self._geometry, columns, lines, sigma_v, gap_px, out, add)
+
+        share_rows(work_rows, stack.shape[2])
+        share_rows(work, stack.shape[1])
+        return add
+
+    def _decode(
+        self, stack: NDArray[Any], plan: AxisPlan, white: int, black: int
+    ) -> tuple[AxisState, Lines, Figures]:
+        layout = make_layout(plan, white, black)
         ys = survey_rows(stack.shape[1])
         few = self._lines((ys.size, plan, "survey"))
         state = survey(stack, ys, plan, layout, self.settings, few)
@@ -143,7 +171,11 @@ class Reconstructor:
             decode_rows(rows, first, last, *arguments, scratch)
 
         share_rows(work, rows.size)
-        return state, lines, figures_of(state, lines, ys)
+        images = [s.image for s in plan.sources]
+        check_identity(lines.tally, images)
+        check_phase(lines.u_px[ys], layout.edge_owner, images)
+        order = check_order(lines.u_px[ys])
+        return state, lines, figures_of(state, lines, ys, order)
 
     def _lines(self, key: tuple[Any, ...]) -> Lines:
         """Scratch for so many rows of an axis, made once."""
@@ -155,6 +187,37 @@ class Reconstructor:
                 np.ones(shape, np.uint8), np.zeros((rows, len(plan.sources), 2), np.int32),
             )  # fmt: skip
         return self._scratch[key]
+
+
+def _jump_limit(settings: Settings, figures: Figures) -> float:
+    """Jumps that noise makes are no depth steps: a second difference has sqrt(6) its sigma."""
+    noise = JUMP_SD * np.sqrt(6) * figures.edge_sigma_px
+    return max(settings.max_jump_px, float(noise)) if noise > 0 else settings.max_jump_px
+
+
+def _output(height: int, boundaries: int) -> Output:
+    shape = (height, boundaries)
+    return Output(
+        np.empty((*shape, 5), np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8)
+    )
+
+
+def turn(plan: DecodePlan, stack: NDArray[Any]) -> tuple[AxisPlan, int, int, NDArray[Any]]:
+    """The row plan's images transposed, and the plan, white and black renumbered to match."""
+    assert plan.row is not None
+    images = plan.row.images
+    turned = np.empty((len(images), stack.shape[2], stack.shape[1]), stack.dtype)
+    for i, image in enumerate(images):
+        cv2.transpose(stack[image], turned[i])
+    at = {image: i for i, image in enumerate(images)} | {-1: -1}
+    row = replace(
+        plan.row, images=tuple(range(len(images))),
+        bits=tuple(replace(b, image=at[b.image], inverse=at[b.inverse]) for b in plan.row.bits),
+        sources=tuple(
+            replace(s, image=at[s.image], inverse=at[s.inverse]) for s in plan.row.sources
+        ),
+    )  # fmt: skip
+    return row, at[plan.white], at[plan.black], turned
 
 
 def make_layout(plan: AxisPlan, white: int, black: int) -> Layout:
@@ -234,7 +297,9 @@ def measure_blur(lines: Lines, plan: AxisPlan, layout: Layout, scale: float) -> 
     return float(np.sqrt(np.clip(variance, 0.3**2, 4.0**2)))
 
 
-def figures_of(state: AxisState, lines: Lines, ys: NDArray[np.int64]) -> Figures:
+def figures_of(
+    state: AxisState, lines: Lines, ys: NDArray[np.int64], order: float
+) -> Figures:
     """Quality figures from the surveyed rows."""
     t = state.tuning
     present = lines.reason[ys] == 0
@@ -242,5 +307,5 @@ def figures_of(state: AxisState, lines: Lines, ys: NDArray[np.int64]) -> Figures
     return Figures(
         edge_blur_px=state.blur_px, scale_px=t.scale * t.direction,
         noise_read_dn2=state.noise.read_dn2, noise_shot_dn=state.noise.shot_dn,
-        edge_sigma_px=float(np.median(sigma)) if sigma.size else float("nan"),
+        edge_sigma_px=float(np.median(sigma)) if sigma.size else float("nan"), order=order,
     )  # fmt: skip

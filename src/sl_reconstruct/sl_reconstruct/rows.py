@@ -135,9 +135,6 @@ def _edges(
         x = np.int64(at[i])
         k, agreed = boundary_of(code, x, filtered[x] < 0, rising_px, half, t)
         reason = light_fails(light, clipped, x, t)
-        if reason == 0 and not agreed:
-            reason = IDENTITY
-            confused += 1
         fraction, slope = cubic_zero(filtered, x, fit, offset)
         phase = phase_of(fraction)
         if paired:
@@ -153,6 +150,9 @@ def _edges(
         good = t.min_slope * full <= steep <= t.max_slope * full and -0.5 <= fraction <= 1.5
         if reason == 0 and not good:
             reason = SHAPE
+        if reason == 0 and not agreed:
+            reason = IDENTITY
+            confused += 1
         if reason != 0:
             if k > 0 and edge_owner[k] == s:
                 _refuse(reasons, k, reason)
@@ -195,10 +195,10 @@ def _bars(
         fraction, slope = cubic_zero(filtered, x, fit, offset)
         ratio = abs(slope) / expected
         reason = light_fails(light, clipped, x, t)
-        if reason == 0 and not agreed:
-            reason = IDENTITY
         if reason == 0 and not t.min_slope <= ratio <= 2 * t.max_slope:
             reason = SHAPE
+        if reason == 0 and not agreed:
+            reason = IDENTITY
         if reason != 0:
             _refuse(reasons, k, reason)
             continue
