@@ -1,0 +1,233 @@
+"""What a calibration asks of the graph: move the stage, project, bring the images.
+
+Not a node of its own; it works for the calibration's node, in a thread beside the executor's.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from geometry_msgs.msg import Point
+from sl_interfaces.msg import MatchedFrame, PatternStack
+from sl_interfaces.srv import MoveStage, Project
+from std_srvs.srv import Trigger
+
+from sl_calibration.session import RunCancelled, Taken
+from sl_projector.base_node import EVENTS, LARGE, RigNode, next_scan_id
+from sl_projector.errors import CalibrationError, DeviceError, DeviceTimeout, SlError
+from sl_reconstruct.messages import stack_from_msg
+from sl_reconstruct.scan_flow import ScanFailed, ScanOrder, ScanRun, ScanTimeouts, ScanWatch
+
+#: A stage that is there answers a question about its travel within this.
+_ANSWER_S = 5.0
+_POLL_S = 0.02
+#: Publishers and services of a graph that has just started are found within this.
+_DISCOVERY_S = 10.0
+
+
+class RigGear:
+    """Drives stage and projector by their services and listens to the synchroniser.
+
+    It is `sl_calibration.session.Gear`, and `sl_reconstruct.scan_flow.Gear` of its own scans.
+
+    Parameters
+    ----------
+    node : RigNode
+        Whose clients and subscriptions these are.
+    """
+
+    def __init__(self, node: RigNode) -> None:
+        self._node = node
+        group = node.long_work
+        self._move = node.create_client(MoveStage, "stage/move", callback_group=group)
+        self._stop_stage = node.create_client(Trigger, "stage/stop", callback_group=group)
+        self._project = node.create_client(Project, "projector/project", callback_group=group)
+        self._stop_projector = node.create_client(Trigger, "projector/stop", callback_group=group)
+        self._watch: ScanWatch | None = None
+        self._last_id = 0
+        self._cancelled: Callable[[], bool] = lambda: False
+        self.move_timeout_s = 120.0
+        self.max_repeats = 2
+        self.timeouts = ScanTimeouts()
+
+    @contextmanager
+    def in_use(self, cancelled: Callable[[], bool]) -> Iterator[RigGear]:
+        """Listen to the synchroniser for one run; its stacks are too large to listen always."""
+        self._cancelled = cancelled
+        subscriptions = [
+            self._node.subscribe(MatchedFrame, "synchronizer/frame", self._on_frame, EVENTS),
+            self._node.subscribe(PatternStack, "synchronizer/stack", self._on_stack, LARGE),
+        ]
+        try:
+            self._await_publishers(subscriptions)
+            yield self
+        finally:
+            self._watch = None
+            self._forget(subscriptions)
+
+    def _await_publishers(self, subscriptions: list[Any]) -> None:
+        end_s = time.monotonic() + _DISCOVERY_S
+        while not all(s.get_publisher_count() for s in subscriptions):
+            if time.monotonic() > end_s:
+                raise CalibrationError(
+                    "nobody publishes synchronizer/stack: is the synchronizer node running?"
+                )
+            self._pause()
+
+    def _forget(self, subscriptions: list[Any]) -> None:
+        """End the subscriptions in the executor's thread, where nobody uses them meanwhile."""
+        executor = self._node.executor
+        if executor is None or not self._node.context.ok():
+            return
+        done = threading.Event()
+
+        def destroy() -> None:
+            for subscription in subscriptions:
+                self._node.destroy_subscription(subscription)
+            done.set()
+
+        executor.create_task(destroy)
+        done.wait(_ANSWER_S)
+
+    def _pause(self) -> None:
+        if self._cancelled():
+            raise RunCancelled("calibration cancelled")
+        time.sleep(_POLL_S)
+
+    # -- stage ----------------------------------------------------------------------------------
+
+    def where(self) -> float:
+        """Height of the stage now, metres."""
+        return self._height(self._ask(0.0, relative=True, check_only=True))
+
+    def check(self, height_m: float) -> None:
+        """Refuse a height outside the travel."""
+        try:
+            self._ask(height_m, check_only=True)
+        except DeviceError as error:
+            raise CalibrationError(
+                f"the stage does not reach {height_m * 1e3:.4f} mm: {error}"
+            ) from error
+
+    def move(self, height_m: float) -> float:
+        """Move in z only; the other axes stay."""
+        return self._height(self._ask(height_m))
+
+    def _ask(self, z_m: float, relative: bool = False, check_only: bool = False) -> Any:
+        """Ask the stage node; what it refuses is raised with its reason."""
+        if not self._move.wait_for_service(timeout_sec=_DISCOVERY_S):
+            raise DeviceError("nobody offers stage/move: is the stage node running?")
+        request = MoveStage.Request(target=Point(z=z_m), relative=relative, check_only=check_only)
+        if not relative:
+            here = self._ask(0.0, relative=True, check_only=True).pose.pose.position
+            request.target.x, request.target.y = here.x, here.y
+        patience_s = _ANSWER_S if check_only else self.move_timeout_s
+        reply = self._answer(self._move.call_async(request), patience_s, "stage/move")
+        if not reply.success:
+            raise DeviceError(reply.message)
+        return reply
+
+    def _answer(self, future: Any, patience_s: float, service: str) -> Any:
+        end_s = time.monotonic() + patience_s
+        while not future.done():
+            if time.monotonic() > end_s:
+                raise DeviceTimeout(f"{service} did not answer within {patience_s:g} s")
+            self._pause()
+        return future.result()
+
+    @staticmethod
+    def _height(reply: Any) -> float:
+        return float(reply.pose.pose.position.z)
+
+    def halt(self) -> None:
+        """Stop stage and projector; their answers are of no interest."""
+        for client in (self._stop_stage, self._stop_projector):
+            if self._node.context.ok() and client.service_is_ready():
+                client.call_async(Trigger.Request())
+
+    # -- images ---------------------------------------------------------------------------------
+
+    def take(self, sequence: str) -> Taken:
+        """Project a sequence; spoilt attempts are repeated."""
+        order = ScanOrder(sequence, 0.0, self.max_repeats)
+        result = ScanRun(self, order, lambda _: None, self._cancelled, self.timeouts).run()
+        self._watch = None
+        if result.cancelled:
+            raise RunCancelled("calibration cancelled")
+        if not result.success:
+            raise CalibrationError(f"no images: {result.message}")
+        taken: Taken = result.report
+        return taken
+
+    def _on_frame(self, message: Any) -> None:
+        watch = self._watch
+        if watch is None or message.scan_id != watch.scan_id:
+            return
+        if message.status == MatchedFrame.MATCHED:
+            watch.matched(message.index, message.count)
+        elif message.status in (MatchedFrame.STACK_COMPLETE, MatchedFrame.STACK_REFUSED):
+            watch.decided(message.status == MatchedFrame.STACK_COMPLETE, message.reason)
+        else:
+            watch.sign()
+
+    def _on_stack(self, message: Any) -> None:
+        watch = self._watch
+        if watch is None or message.scan_id != watch.scan_id:
+            return
+        watch.arrived()
+        try:
+            watch.finished(_taken(message))
+        except SlError as error:
+            watch.finished(error)
+
+    # -- what a scan needs (`scan_flow.Gear`) ---------------------------------------------------
+
+    def begin(self) -> ScanWatch:
+        """Take a number that no scan had."""
+        self._last_id = next_scan_id(self._last_id)
+        self._watch = ScanWatch(self._last_id)
+        return self._watch
+
+    def missing(self) -> str:
+        """Name what a scan cannot do without and nobody offers."""
+        if not self._project.wait_for_service(timeout_sec=3.0):
+            return "nobody offers projector/project: is the projector node running?"
+        if not self._node.count_publishers("camera/image_raw"):
+            return "nobody publishes camera/image_raw: is the camera node running?"
+        return ""
+
+    def project(self, watch: ScanWatch, order: ScanOrder) -> None:
+        """Ask the projector; the watch is told when it has answered."""
+        request = Project.Request(
+            sequence=order.sequence, scan_id=watch.scan_id, exposure_s=order.exposure_s
+        )
+
+        def answered(future: Any) -> None:
+            reply = future.result()
+            watch.answered(reply.success, reply.count, reply.message)
+
+        try:
+            self._project.call_async(request).add_done_callback(answered)
+        except RuntimeError as error:  # rclpy: the context is gone
+            raise ScanFailed(f"the projector cannot be asked: {error}") from error
+
+    def stop_projecting(self) -> None:
+        """Ask the projector to stop."""
+        if self._stop_projector.service_is_ready():
+            self._stop_projector.call_async(Trigger.Request())
+
+
+def _taken(message: Any) -> Taken:
+    """Images and pose of a stack; a stack without a pose is of no use here."""
+    stack = stack_from_msg(message)
+    if not message.stage_pose.header.frame_id:
+        raise CalibrationError(
+            f"the stack of scan {message.scan_id} has no stage pose; expected one: set the "
+            "synchronizer's parameter require_pose"
+        )
+    height_m = float(message.stage_pose.pose.position.z)
+    return Taken(stack.take_images(), stack.sequence, height_m)

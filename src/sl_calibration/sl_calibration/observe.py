@@ -1,0 +1,106 @@
+"""From one stack to one view: the plate's holes in white light, and the projector's coordinates."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_calibration.detect import detect_plate
+from sl_calibration.views import View
+from sl_calibration.plate import Plate
+from sl_calibration.session import Order, Taken
+from sl_projector.errors import CalibrationError
+from sl_projector.sequence import Pattern, PatternSequence
+from sl_reconstruct.correspondence import correspondences
+
+#: White must differ from black by this part of the full scale in some part of the image.
+MIN_LIGHT = 0.05
+#: The part of the image that must be lit so.
+MIN_LIT_PART = 0.02
+#: Fewer targets than this in a view do not carry a projector's calibration.
+MIN_TARGETS = 30
+
+
+def observe(taken: Taken, order: Order) -> View:
+    """Measure the plate in one stack.
+
+    Raises
+    ------
+    CalibrationError
+        When the projector gives no light, the plate is not there or not as it should be, or the
+        projector's patterns are not seen on it.
+    """
+    check_light(taken.images, taken.sequence)
+    holes = detect_plate(white_image(taken.images, taken.sequence), order.plate)
+    targets = correspondences(taken.images, taken.sequence)
+    if len(targets) < MIN_TARGETS:
+        raise CalibrationError(
+            f"the projector's coordinates were decoded at {len(targets)} places; expected at least "
+            f"{MIN_TARGETS}: is the plate in focus and evenly lit, and the exposure right?"
+        )
+    good = holes.good
+    return View(
+        taken.height_m,
+        holes.ids[good], holes.plate_xy_m[good], holes.centres_px[good], holes.sigma_px[good],
+        targets.camera_px, targets.dmd_px, targets.sigma_px,
+    )  # fmt: skip
+
+
+def white_image(stack: NDArray[Any], sequence: PatternSequence) -> NDArray[np.float32]:
+    """Mean image under full light, (H, W): every pattern and its inverse add up to one.
+
+    Averaging over all pairs takes the camera's noise down by their number's root, and the stripes
+    cancel exactly.
+    """
+    pairs = _pairs(sequence)
+    lit = [i for i, p in enumerate(sequence.patterns) if _full(p) is True]
+    dark = [i for i, p in enumerate(sequence.patterns) if _full(p) is False]
+    if not lit and not pairs:
+        raise CalibrationError(
+            f"sequence {sequence.name!r} shows neither white nor a pattern with its inverse; "
+            "expected one of them to find the holes in"
+        )
+    total = np.zeros(stack.shape[1:], np.float32)
+    for i in lit:
+        total += stack[i]
+    if not (dark and pairs):
+        return total if not lit else total / len(lit)
+    # A pair holds the ambient light twice, white holds it once.
+    ambient = np.mean([stack[i] for i in dark], axis=0, dtype=np.float32)
+    for i, j in pairs:
+        total += stack[i]
+        total += stack[j]
+    return (total - len(pairs) * ambient) / np.float32(len(lit) + len(pairs))
+
+
+def _full(pattern: Pattern) -> bool | None:
+    """Whether everything is on (True) or off (False); None for stripes."""
+    return None if pattern.kind == "gray" else (pattern.kind == "white") != pattern.inverted
+
+
+def _pairs(sequence: PatternSequence) -> list[tuple[int, int]]:
+    index = {p: i for i, p in enumerate(sequence.patterns) if p.kind == "gray"}
+    found = [(i, index.get(p.inverse(), -1)) for p, i in index.items()]
+    return [(i, j) for i, j in found if i < j]
+
+
+def check_light(stack: NDArray[Any], sequence: PatternSequence) -> None:
+    """Refuse a stack on which the projector's light makes no difference.
+
+    Raises
+    ------
+    CalibrationError
+        With the light that was found and the least that is expected.
+    """
+    few = stack[:, ::8, ::8]
+    light = few.max(axis=0).astype(np.float64) - few.min(axis=0)
+    full = float(np.iinfo(stack.dtype).max)
+    found = float(np.quantile(light, 1.0 - MIN_LIT_PART))
+    if found < MIN_LIGHT * full:
+        raise CalibrationError(
+            f"the projector's light makes a difference of {found:.0f} of {full:.0f} DN; expected at "
+            f"least {MIN_LIGHT * full:.0f} in {MIN_LIT_PART:.0%} of the image: is its lamp on, "
+            "does it reach the plate, and is the camera exposed long enough?"
+        )

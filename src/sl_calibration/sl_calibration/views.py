@@ -1,0 +1,148 @@
+"""What a calibration is solved from, kept so that it can be solved again.
+
+Nothing here is a result: plate coordinates that were given, pixels that were measured, heights
+that the stage told.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_projector.documents import written_atomically
+from sl_projector.errors import CalibrationError
+
+Array = NDArray[np.float64]
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class View:
+    """The plate at one height of the stage, seen by the camera and lit by the projector.
+
+    Parameters
+    ----------
+    height_m : float
+        Stage z, as the stage tells it, metres.
+    hole_ids : ndarray, (N, 2), int
+        Column and row of each hole on the plate.
+    plate_xy_m : ndarray, (N, 2)
+        Where the holes are on the plate, metres.
+    centres_px : ndarray, (N, 2)
+        Images of their centres, camera pixels.
+    centres_sigma_px : ndarray, (N,)
+        1-sigma of each coordinate.
+    camera_px : ndarray, (M, 2)
+        Camera pixels on the plate at which the projector's coordinates were decoded.
+    dmd_px : ndarray, (M, 2)
+        DMD column and row that light them.
+    dmd_sigma_px : ndarray, (M, 2)
+        Their 1-sigma.
+    """
+
+    height_m: float
+    hole_ids: NDArray[np.int64]
+    plate_xy_m: Array
+    centres_px: Array
+    centres_sigma_px: Array
+    camera_px: Array
+    dmd_px: Array
+    dmd_sigma_px: Array
+
+
+@dataclass(frozen=True)
+class Observations:
+    """All views of a run, and what has to be known beside them.
+
+    Parameters
+    ----------
+    views : tuple of View
+        In the order in which they were taken.
+    camera_size, dmd_size : tuple of int
+        (width, height), pixels.
+    camera_pitch_m, dmd_pitch_m : float
+        Pixel pitch on the chips, metres; for reports in millimetres only.
+    made_from : mapping
+        Where, when and with what they were taken; plain values.
+    """
+
+    views: tuple[View, ...]
+    camera_size: tuple[int, int]
+    dmd_size: tuple[int, int]
+    camera_pitch_m: float
+    dmd_pitch_m: float
+    made_from: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def holes(self) -> int:
+        """Holes of all views."""
+        return sum(len(view.hole_ids) for view in self.views)
+
+    @property
+    def targets(self) -> int:
+        """Projector targets of all views."""
+        return sum(len(view.camera_px) for view in self.views)
+
+
+def save_observations(path: Path, observations: Observations) -> None:
+    """Write a ``.npz`` in one step: arrays ``NAME_i`` of view i, and the rest as JSON ``about``."""
+    about = {
+        "format": FORMAT,
+        "views": len(observations.views),
+        **{k: v for k, v in vars(observations).items() if k != "views"},
+    }
+    arrays = {
+        f"{name}_{i}": np.asarray(value)
+        for i, view in enumerate(observations.views)
+        for name, value in asdict(view).items()
+    }
+    with written_atomically(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
+
+
+def load_observations(path: Path) -> Observations:
+    """Read what `save_observations` wrote.
+
+    Raises
+    ------
+    CalibrationError
+        When the file is not one, or incomplete.
+    """
+    names = View.__dataclass_fields__
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            about = json.loads(str(file["about"]))
+            _check_format(about, path)
+            views = [
+                {name: file[f"{name}_{i}"] for name in names} for i in range(int(about["views"]))
+            ]
+        made = [View(**{**view, "height_m": float(view["height_m"])}) for view in views]
+        return Observations(
+            tuple(made), _size(about["camera_size"]), _size(about["dmd_size"]),
+            float(about["camera_pitch_m"]), float(about["dmd_pitch_m"]), about["made_from"],
+        )  # fmt: skip
+    except CalibrationError:
+        raise
+    except (OSError, KeyError, ValueError, TypeError, EOFError) as error:
+        raise CalibrationError(
+            f"{path} holds no observations ({error}); expected the observations.npz of a run"
+        ) from error
+
+
+def _check_format(about: Mapping[str, Any], path: Path) -> None:
+    if about.get("format") != FORMAT:
+        raise CalibrationError(
+            f"{path} is of format {about.get('format')}; expected format {FORMAT}"
+        )
+
+
+def _size(value: Any) -> tuple[int, int]:
+    width, height = value
+    return int(width), int(height)
