@@ -29,15 +29,9 @@ from sl_projector.documents import write_text
 from sl_projector.errors import BagError, CalibrationError, ConfigError, SlError
 from sl_reconstruct.cloud import Cloud
 from sl_reconstruct.cloud_files import cloud_hash
+from sl_reconstruct.quality import verdict
 from sl_reconstruct.settings import Settings
 from sl_reconstruct.workshop import Workshop
-
-#: Less than this part of the lit positions is no measurement of a surface.
-MIN_PRESENT = 0.2
-#: More than this part refused because the rays do not meet: the rig is another one.
-MAX_GEOMETRY = 0.1
-#: Residual of the four equations that a calibration may leave, pixels.
-MAX_MEDIAN_GAP_PX = 1.0
 
 VERDICTS = (Status.STACK_COMPLETE, Status.STACK_REFUSED)
 
@@ -213,9 +207,9 @@ def _measure(
     if workshop.calibration_hash != in_force.calibration.hash:
         workshop.calibrate(in_force.calibration)
     cloud = workshop(stack.data, stack.sequence).cloud
-    reasons = _faults(cloud)
+    good, reasons = verdict(cloud)
     report.update(
-        good=not reasons,
+        good=good,
         reasons=reasons,
         cloud_hash=cloud_hash(cloud.points),
         points=cloud.present,
@@ -226,35 +220,6 @@ def _measure(
         median_sigma_m=_median(cloud.points["sigma"]),
     )
     return cloud
-
-
-def _faults(cloud: Cloud) -> list[str]:
-    """Why a cloud is not good, in words; empty when it is.
-
-    Where the sequence has row patterns the fourth equation checks the calibration: rays that miss
-    each other by more than `MAX_MEDIAN_GAP_PX` come from a rig that is not the calibrated one.
-    """
-    if not cloud.present:
-        worst = max(cloud.refused, key=lambda name: cloud.refused[name])
-        return [f"no points: {cloud.lit} lit positions, refused mostly for {worst}"]
-    faults = []
-    if cloud.present < MIN_PRESENT * cloud.lit:
-        faults.append(
-            f"only {100 * cloud.present / cloud.lit:.1f} % of the lit positions gave a point; "
-            f"expected at least {100 * MIN_PRESENT:.0f} %"
-        )
-    if cloud.refused["geometry"] > MAX_GEOMETRY * cloud.lit:
-        faults.append(
-            f"at {100 * cloud.refused['geometry'] / cloud.lit:.1f} % of the lit positions the rays "
-            "of camera and projector do not meet; the calibration does not fit these images"
-        )
-    if cloud.gap_px is not None and not _median(cloud.gap_px) <= MAX_MEDIAN_GAP_PX:
-        faults.append(
-            f"the rays of camera and projector miss each other by {_median(cloud.gap_px):.3g} px "
-            f"(median); expected at most {MAX_MEDIAN_GAP_PX:g} px: the calibration does not fit "
-            "these images"
-        )
-    return faults
 
 
 def _figures(cloud: Cloud) -> dict[str, float]:
