@@ -91,6 +91,7 @@ class FakeCamera:
         self.triggered = 0
         self.counts = CameraStatistics()
         self.image_size = (320, 120)
+        self.latency_s = 0.0
 
     def open(self) -> None:
         if self.gone:

@@ -512,15 +512,39 @@ def test_exposure_is_a_parameter_and_what_the_camera_cannot_is_refused() -> None
 
 
 def test_a_software_triggered_camera_follows_the_projector() -> None:
+    """Frames get the stamp of the pattern in which they were exposed wholly, or are thrown away."""
     with ros_graph.graph() as graph:
         driver = FakeCamera()
-        graph.add(CameraNode, lambda: driver, trigger="software")
+        node = graph.add(CameraNode, lambda: driver, trigger="software", exposure_s=0.01)
+        images = graph.collect(Image, "camera/image_raw", IMAGES)
         wait(lambda: driver.armed, "the camera")
         triggers = graph.publisher(PatternTrigger, "projector/trigger", EVENTS)
-        triggers.publish(PatternTrigger())
+
+        def show(pattern_s: float) -> int:
+            message = PatternTrigger(exposure_s=pattern_s)
+            stamp_ns = time.time_ns()
+            message.header.stamp = stamp_to_msg(stamp_ns)
+            triggers.publish(message)
+            return stamp_ns
+
+        def expose(start_ns: int) -> None:
+            driver.frames.put(Frame(np.zeros((4, 4), np.uint8), 1, start_ns, 0.01))
+
+        first_ns = show(5.0)
         wait(lambda: driver.triggered == 1, "a software trigger")
+        expose(first_ns + 300_000_000)
+        wait(lambda: images, "the image")
+        assert stamp_from_msg(images[0].header.stamp) == first_ns
         assert graph.call(Trigger, "camera/trigger", Trigger.Request()).success
         assert driver.triggered == 2
+
+        second_ns = show(5.0)
+        wait(lambda: driver.triggered == 3, "a software trigger")
+        expose(second_ns + 4_995_000_000)  # ends 5 ms after its pattern
+        wait(lambda: "ended" in node.last_error, "the complaint")
+        show(0.012)  # 5 ms to settle and 10 ms of exposure do not fit
+        wait(lambda: "needs 0.015 s" in node.last_error, "the complaint")
+        assert (driver.triggered, len(images)) == (3, 1)
 
 
 # -- stage ----------------------------------------------------------------------------------------

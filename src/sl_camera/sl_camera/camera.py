@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from sl_projector.errors import ConfigError
 
 TriggerMode = Literal["hardware", "software", "free"]
-PixelFormat = Literal["mono8", "mono16"]
+PixelFormat = Literal["mono8", "mono10", "mono10p", "mono12", "mono12p", "mono16"]
+Encoding = Literal["mono8", "mono16"]
 
 TRIGGER_MODES: tuple[TriggerMode, ...] = ("hardware", "software", "free")
-PIXEL_DTYPES: dict[str, np.dtype[np.uint8] | np.dtype[np.uint16]] = {
-    "mono8": np.dtype(np.uint8),
-    "mono16": np.dtype(np.uint16),
-}
+#: Significant bits of each pixel format; "p" is packed on the way, for slow cables.
+PIXEL_BITS: dict[PixelFormat, int] = {
+    "mono8": 8, "mono10": 10, "mono10p": 10, "mono12": 12, "mono12p": 12, "mono16": 16,
+}  # fmt: skip
 
 
 class FrameStatus(StrEnum):
@@ -50,6 +51,8 @@ class Frame:
         Exposure as the camera says, seconds.
     status : FrameStatus
         Whether all pixels are there.
+    bits : int
+        Significant bits of a pixel; 0: all of its type.
     """
 
     image: NDArray[np.uint8] | NDArray[np.uint16]
@@ -57,11 +60,17 @@ class Frame:
     stamp_ns: int
     exposure_s: float
     status: FrameStatus = FrameStatus.OK
+    bits: int = 0
 
     @property
-    def encoding(self) -> PixelFormat:
+    def encoding(self) -> Encoding:
         """ROS name of the pixel format."""
         return "mono8" if self.image.dtype == np.uint8 else "mono16"
+
+    @property
+    def full_scale_dn(self) -> int:
+        """Largest value that a pixel can have: there it is saturated."""
+        return (1 << (self.bits or 8 * self.image.itemsize)) - 1
 
 
 @dataclass(frozen=True)
@@ -78,8 +87,8 @@ class CameraSettings:
         A frame per edge on the trigger line, per call of `software_trigger`, or as fast as it goes.
     region : tuple of int or None
         (x, y, width, height), pixels; None is the whole sensor.
-    pixel_format : {"mono8", "mono16"}
-        Bits per pixel.
+    pixel_format : {"mono8", "mono10", "mono10p", "mono12", "mono12p", "mono16"}
+        Bits per pixel, "p" packed on the cable; above 8 they come as 16-bit integers, not scaled.
 
     Raises
     ------
@@ -100,9 +109,9 @@ class CameraSettings:
             raise ConfigError(f"gain={self.gain}; expected more than 0, at most 1000")
         if self.trigger not in TRIGGER_MODES:
             raise ConfigError(f"trigger={self.trigger!r}; expected one of {TRIGGER_MODES}")
-        if self.pixel_format not in PIXEL_DTYPES:
+        if self.pixel_format not in PIXEL_BITS:
             raise ConfigError(
-                f"pixel_format={self.pixel_format!r}; expected one of {sorted(PIXEL_DTYPES)}"
+                f"pixel_format={self.pixel_format!r}; expected one of {sorted(PIXEL_BITS)}"
             )
         if self.region is not None and (min(self.region[:2]) < 0 or min(self.region[2:]) < 1):
             raise ConfigError(f"region={self.region}; expected x, y >= 0 and width, height >= 1")
@@ -124,6 +133,11 @@ class CameraDriver(Protocol):
     @property
     def image_size(self) -> tuple[int, int]:
         """(width, height) of the next frames, pixels; valid after `configure`."""
+        ...
+
+    @property
+    def latency_s(self) -> float:
+        """From `software_trigger` to the start of the exposure at the latest, seconds."""
         ...
 
     def open(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
@@ -15,8 +16,9 @@ from sensor_msgs.msg import CameraInfo, Image
 from sl_interfaces.msg import PatternTrigger, RigCalibration
 from std_srvs.srv import Trigger
 
+from sl_camera.aravis_camera import AravisOptions
 from sl_camera.camera import (
-    PIXEL_DTYPES,
+    PIXEL_BITS,
     TRIGGER_MODES,
     CameraDriver,
     CameraSettings,
@@ -24,8 +26,10 @@ from sl_camera.camera import (
     Frame,
     FrameStatus,
 )
+from sl_camera.camera_drivers import ADDRESSES, make_camera
 from sl_camera.messages import camera_info_for, image_to_msg
-from sl_camera.socket_camera import SocketCamera
+from sl_camera.software_trigger import PatternWindows
+from sl_camera.uvc_camera import UvcOptions
 from sl_projector.base_node import (
     CAMERA_FRAME,
     EVENTS,
@@ -38,6 +42,7 @@ from sl_projector.base_node import (
 )
 from sl_projector.device_link import DeviceLink
 from sl_projector.errors import DeviceError, DeviceRefused, SlError
+from sl_projector.messages import stamp_from_msg
 
 READ_TIMEOUT_S = 0.1
 SETTING_TIMEOUT_S = 3.0
@@ -60,15 +65,22 @@ class CameraNode(RigNode):
     ) -> None:
         super().__init__("camera", **options)
         self._settings = self._declare_settings()
-        self._address = self.declare("address", "", "where the camera is served: socket path")
-        self._make_driver = make_driver or self._make_socket_camera
+        self._address = self.declare("address", "", ADDRESSES)
+        self._aravis, self._uvc = self._declare_device_options()
+        self._make_driver = make_driver or self._make_configured
         self._calibrated: CameraInfo | None = None
+        self._full_scale_dn = 0
         self._statistics = CameraStatistics()
         self._orders: SimpleQueue[tuple[CameraSettings, Future[None]]] = SimpleQueue()
         self._stop = threading.Event()
         self._images = self.create_publisher(Image, "camera/image_raw", IMAGES)
         self._infos = self.create_publisher(CameraInfo, "camera/camera_info", IMAGES)
         self.subscribe(RigCalibration, "calibration/rig", self._on_calibration, LATCHED)
+        self._windows = PatternWindows(
+            self.declare(
+                "settle_s", 0.005, "software trigger: after a pattern's start, s", 0.0, 10.0
+            )
+        )
         if self._settings.trigger == "software":
             self.subscribe(PatternTrigger, "projector/trigger", self._on_trigger, EVENTS)
         self.create_service(Trigger, "camera/trigger", self._trigger)
@@ -91,7 +103,29 @@ class CameraNode(RigNode):
             trigger=self.declare("trigger", default.trigger, f"one of {TRIGGER_MODES}"),
             region=tuple(region) if region[2] else None,
             pixel_format=self.declare(
-                "pixel_format", default.pixel_format, f"one of {sorted(PIXEL_DTYPES)}"
+                "pixel_format", default.pixel_format, f"one of {sorted(PIXEL_BITS)}"
+            ),
+        )
+
+    def _declare_device_options(self) -> tuple[AravisOptions, UvcOptions]:
+        aravis, uvc = AravisOptions(), UvcOptions()
+        width, height = self.declare(
+            "uvc_image_size", [0, 0], "UVC: width, height, pixels; 0: the camera's own choice"
+        )
+        return (
+            AravisOptions(
+                self.declare("trigger_line", aravis.trigger_line, "Aravis: the trigger's input"),
+                self.declare(
+                    "packet_size", 0, "GigE Vision: bytes; 0: what the network passes", 0, 65535
+                ),
+                self.declare("buffers", aravis.buffers, "Aravis: frames that may wait", 4, 4096),
+                self.declare("features", "", "Aravis: more GenICam features, 'Name=Value ...'"),
+            ),
+            UvcOptions(
+                self.declare(
+                    "settle_frames", uvc.settle_frames, "UVC: frames dropped per trigger", 1, 100
+                ),
+                (width, height),
             ),
         )
 
@@ -109,6 +143,7 @@ class CameraNode(RigNode):
             "times lost": self._link.losses + self._statistics.reconnects,
             "exposure_s": self._settings.exposure_s,
             "trigger": self._settings.trigger,
+            "full scale": f"{self._full_scale_dn} DN" if self._full_scale_dn else "no frame yet",
         }
         return Health(level, message, "camera", self._address, values)
 
@@ -125,8 +160,8 @@ class CameraNode(RigNode):
         except DeviceError:
             return self._statistics
 
-    def _make_socket_camera(self) -> CameraDriver:
-        return SocketCamera(self._address)
+    def _make_configured(self) -> CameraDriver:
+        return make_camera(self._address, self._aravis, self._uvc)
 
     def _connect(self) -> CameraDriver:
         driver = self._make_driver()
@@ -162,17 +197,37 @@ class CameraNode(RigNode):
         if frame.status is not FrameStatus.OK:
             self.get_logger().warning(f"frame {frame.frame_id} came incomplete, thrown away")
             return
+        if self._settings.trigger == "software":
+            try:
+                frame = self._windows.take(frame)
+            except DeviceError as error:
+                self.complain("camera/image_raw", error)
+                return
+        self._full_scale_dn = frame.full_scale_dn
         image = image_to_msg(frame.image, frame.stamp_ns, CAMERA_FRAME)
         self._images.publish(image)
         self._infos.publish(camera_info_for(self._calibrated, image))
 
     def _on_calibration(self, message: RigCalibration) -> None:
-        self._calibrated = message.camera
+        """Take the calibration that came in force last; several nodes latch one."""
+        stamp_ns = stamp_from_msg(message.header.stamp)
+        if stamp_ns >= self._calibrated_ns:
+            self._calibrated, self._calibrated_ns = message.camera, stamp_ns
 
     # -- triggering and settings --------------------------------------------------------------
 
-    def _on_trigger(self, _message: PatternTrigger) -> None:
-        self._link.device().software_trigger()
+    def _on_trigger(self, message: PatternTrigger) -> None:
+        """Trigger the camera when the pattern has settled; a refused one is lost, and told."""
+        driver, start_ns = self._link.device(), stamp_from_msg(message.header.stamp)
+        window = self._windows.announce(
+            start_ns, message.exposure_s, self._settings.exposure_s, driver.latency_s
+        )
+        self._stop.wait(max(0.0, start_ns * 1e-9 + self._windows.settle_s - time.time()))
+        try:
+            driver.software_trigger()
+        except SlError:
+            self._windows.withdraw(window)
+            raise
 
     def _trigger(self, _request: Any, response: Any) -> Any:
         try:

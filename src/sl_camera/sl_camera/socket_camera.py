@@ -23,6 +23,7 @@ REPLY_TIMEOUT_S = 5.0
 #: Between two attempts to find a lost camera again.
 RETRY_S = 0.2
 SOCKET_BUFFER = 1 << 22
+SOFTWARE_LATENCY_S = 0.005
 
 
 class SocketCamera:
@@ -61,6 +62,11 @@ class SocketCamera:
     def image_size(self) -> tuple[int, int]:
         """(width, height) that the camera agreed to; (0, 0) before `configure`."""
         return self._image_size
+
+    @property
+    def latency_s(self) -> float:
+        """From a software trigger to the exposure: the way through the socket."""
+        return SOFTWARE_LATENCY_S
 
     # -- what the owner calls ---------------------------------------------------------------
 

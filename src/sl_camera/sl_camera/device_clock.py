@@ -1,0 +1,46 @@
+"""A camera's own clock, told in the host's time."""
+
+from __future__ import annotations
+
+from collections import deque
+
+#: Samples that decide; older ones are forgotten, so that drift is followed.
+WINDOW = 32
+
+
+class DeviceClock:
+    """Host time of a device's time stamps.
+
+    Two kinds of evidence, the better one wins: a latched device time between two readings of the
+    host's clock (right to half their distance), or frames' arrivals, of which the least delayed
+    tells the offset (right to that frame's delay, so stamps come out late by it).
+    """
+
+    def __init__(self) -> None:
+        self._latched_ns: int | None = None
+        self._delays_ns: deque[int] = deque(maxlen=WINDOW)
+
+    @property
+    def latched(self) -> bool:
+        """Whether the device's clock itself was read."""
+        return self._latched_ns is not None
+
+    def latch(self, samples: list[tuple[int, int, int]]) -> None:
+        """Take readings of the device's clock.
+
+        Parameters
+        ----------
+        samples : list of (before_ns, device_ns, after_ns)
+            Host clock before the reading, device clock, host clock after; the tightest counts.
+        """
+        before_ns, device_ns, after_ns = min(samples, key=lambda s: s[2] - s[0])
+        self._latched_ns = (before_ns + after_ns) // 2 - device_ns
+
+    def arrival(self, device_ns: int, host_ns: int, exposure_s: float) -> None:
+        """Take a frame: it arrived at `host_ns`, at least its exposure after its stamp."""
+        self._delays_ns.append(host_ns - device_ns - round(exposure_s * 1e9))
+
+    def host_ns(self, device_ns: int) -> int:
+        """Host time of a device time; needs a reading or a frame before."""
+        offset_ns = self._latched_ns if self._latched_ns is not None else min(self._delays_ns)
+        return device_ns + offset_ns
