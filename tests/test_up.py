@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from sl_bringup.graph import is_running, lock_directory
-from sl_bringup.graph_config import Changes, find_config, write_config
+from sl_bringup.graph_config import NODES, Changes, find_config, write_config
 from sl_bringup.supervisor import Process, Supervisor, Timing
 from sl_projector.errors import ConfigError
 
@@ -190,7 +190,7 @@ def test_the_bench_file_gets_its_endpoints_and_the_users_changes(tmp_path: Path)
     written = sections(write_config(find_config("bench.yaml"), tmp_path, changes))
     assert written["/sl/projector"]["device"] == f"socket:{tmp_path}/usb.sock"
     assert written["/sl/stage"]["port"] == f"{tmp_path}/stage"
-    assert written["/sl/reconstruct"]["calibration_file"] == f"{tmp_path}/mine.yaml"
+    assert written["/sl/calibration"]["calibration_file"] == f"{tmp_path}/mine.yaml"
     assert written["/sl/bench"]["surface"] == "coin"
     assert written["/sl/bench"]["rig"] == "reference"
 
@@ -223,5 +223,5 @@ def test_a_file_that_is_no_parameter_file_is_refused(tmp_path: Path, text: str) 
 @pytest.mark.parametrize("name", ["bench.yaml", "hardware.yaml"])
 def test_both_files_name_every_node(name: str) -> None:
     found = yaml.safe_load(find_config(name).read_text())
-    nodes = {f"/sl/{n}" for n in ("projector", "camera", "stage", "synchronizer", "reconstruct")}
+    nodes = {f"/sl/{name}" for name in NODES}
     assert nodes | ({"/sl/bench"} if name == "bench.yaml" else set()) == set(found)

@@ -150,16 +150,30 @@ def configuration(options: GraphOptions) -> list[Finding]:
     if options.bench:
         return found
     sections = yaml.safe_load(config.read_text())
-    key = f"{options.changes.namespace}/reconstruct"
-    file = sections.get(key, {}).get("ros__parameters", {}).get("calibration_file", "")
-    return [*found, _calibration(file)]
+    parameters = {
+        name: sections.get(f"{options.changes.namespace}/{name}", {}).get("ros__parameters", {})
+        for name in ("calibration", "reconstruct")
+    }
+    named = [str(p["calibration_file"]) for p in parameters.values() if p.get("calibration_file")]
+    store = parameters["calibration"].get("store_dir")
+    return [*found, _calibration(named[0] if named else _accepted(store))]
+
+
+def _accepted(store_dir: str | None) -> str:
+    """Last accepted calibration of the store; empty when there is none."""
+    from sl_calibration.store import Store, default_directory
+
+    try:
+        return str(Store(Path(store_dir) if store_dir else default_directory()).current() or "")
+    except SlError:
+        return ""
 
 
 def _calibration(file: str) -> Finding:
     from sl_reconstruct.calibration_file import load_calibration
 
     if not file:
-        remedy = "name one in the configuration, or --calibration FILE"
+        remedy = "run 'slrig calibrate', or name one with --calibration FILE"
         return Finding("bad", "calibration", "none is named; scans will be refused", remedy)
     try:
         calibration = load_calibration(Path(file))

@@ -26,7 +26,10 @@ NODES = {
     "stage": "sl_camera.stage_node",
     "synchronizer": "sl_camera.synchronizer_node",
     "reconstruct": "sl_reconstruct.reconstruct_node",
+    "calibration": "sl_calibration.calibration_node",
 }
+#: Sections that may name a calibration file; the graph's is the calibration node's.
+CALIBRATED = ("/sl/calibration", "/sl/reconstruct")
 RUNTIME_VARIABLE = "$(var runtime_dir)"
 TRUE_RIG = "true_rig.yaml"
 
@@ -38,16 +41,19 @@ class Changes:
     Parameters
     ----------
     calibration : Path or None
-        Calibration file of the reconstruction.
+        Calibration that is in force at the start.
     surface : str
         Part on the bench; empty: the file's.
     ros_args : sequence of str
         Passed on to every node; a new ``__ns`` moves the sections of the file as well.
+    uncalibrated : bool
+        Start without any calibration, whatever the file names.
     """
 
     calibration: Path | None = None
     surface: str = ""
     ros_args: Sequence[str] = field(default_factory=tuple)
+    uncalibrated: bool = False
 
     @property
     def namespace(self) -> str:
@@ -100,11 +106,16 @@ def write_config(source: Path, directory: Path, changes: Changes) -> Path:
     """
     text = read_text(source, ConfigError).replace(RUNTIME_VARIABLE, str(directory))
     document = _checked(parse_document(text, str(source), ConfigError), source)
-    _resolve(document, "/sl/reconstruct", "calibration_file", source.parent)
+    for section in CALIBRATED:
+        _resolve(document, section, "calibration_file", source.parent)
+    _resolve(document, CALIBRATED[0], "store_dir", source.parent)
     if document.get(BENCH, {}).get("ros__parameters", {}).get("rig") != "reference":
         _resolve(document, BENCH, "rig", source.parent)
+    if changes.calibration or changes.uncalibrated:
+        for section in CALIBRATED:
+            document.get(section, {}).get("ros__parameters", {}).pop("calibration_file", None)
     if changes.calibration:
-        set_parameter(document, "/sl/reconstruct", "calibration_file", changes.calibration)
+        set_parameter(document, CALIBRATED[0], "calibration_file", changes.calibration)
     if changes.surface:
         set_parameter(document, BENCH, "surface", changes.surface)
     moved = {_moved(key, changes.namespace): value for key, value in document.items()}

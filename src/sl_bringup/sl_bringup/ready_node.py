@@ -13,7 +13,10 @@ from rclpy.node import Node
 
 from sl_bringup.progress import complain, say
 
-SERVICES = ("projector/project", "stage/move", "stage/home", "scan", "scan/_action/send_goal")
+SERVICES = (
+    "projector/project", "stage/move", "stage/home", "scan", "scan/_action/send_goal",
+    "calibration/calibrate", "calibration/calibrate/_action/send_goal",
+)  # fmt: skip
 #: What is missing is said when it has been so for the first wait, and again after the second.
 PATIENCE_S, REPEAT_S = 5.0, 20.0
 
@@ -33,15 +36,30 @@ class ReadyNode(Node):  # type: ignore[misc]  # rclpy carries no types
         super().__init__("ready", namespace=namespace)
         self._nodes = nodes
         self._said: dict[str, tuple[bytes, str]] = {}
+        self._calibrations: dict[str, str] = {}
         self.create_subscription(DiagnosticArray, "/diagnostics", self._listen, 50)
 
     def _listen(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            self._said[status.name.partition(":")[0]] = (status.level, status.message)
+            name, level = status.name.partition(":")[0], status.level
+            values = {item.key: item.value for item in status.values}
+            if "calibration" in values:
+                self._calibrations[name] = values["calibration"]
+            # A rig that has yet to be calibrated is ready for just that.
+            if values.get("compiled") == "True" and level == DiagnosticStatus.WARN:
+                level = DiagnosticStatus.OK
+            self._said[name] = (level, status.message)
+
+    @property
+    def uncalibrated(self) -> bool:
+        """Whether no node knows a calibration."""
+        return not any(self._calibrations.values())
 
     def missing(self) -> list[str]:
         """Say what is not ready, in words; warnings are not errors but worth a wait."""
         found = [fault for name in self._nodes if (fault := self._fault(name))]
+        if len(set(self._calibrations.values())) > 1:
+            found.append("the calibration in force has not reached every node yet")
         offered = {name for name, _ in self.get_service_names_and_types()}
         prefix = self.get_namespace().rstrip("/")
         return found + [f"no service {s}" for s in SERVICES if f"{prefix}/{s}" not in offered]
@@ -79,7 +97,10 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         rclpy.init(args=[])
         node = ReadyNode(options.namespace, options.nodes)
-        return 0 if wait(node, options.timeout) else 1
+        ready = wait(node, options.timeout)
+        if ready and node.uncalibrated:
+            say("the rig is not calibrated: put the hole plate on and run 'slrig calibrate'")
+        return 0 if ready else 1
     except (KeyboardInterrupt, ExternalShutdownException):
         return 130
     finally:

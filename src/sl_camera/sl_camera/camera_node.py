@@ -69,6 +69,7 @@ class CameraNode(RigNode):
         self._aravis, self._uvc = self._declare_device_options()
         self._make_driver = make_driver or self._make_configured
         self._calibrated: CameraInfo | None = None
+        self._calibrated_ns = 0
         self._full_scale_dn = 0
         self._statistics = CameraStatistics()
         self._orders: SimpleQueue[tuple[CameraSettings, Future[None]]] = SimpleQueue()

@@ -42,7 +42,7 @@ from sl_projector.errors import (
     SequenceError,
     SlError,
 )
-from sl_projector.messages import trigger_to_msg
+from sl_projector.messages import stamp_from_msg, trigger_to_msg
 from sl_projector.sequence import NAMED, PatternSequence, named
 from sl_projector.sequence_file import load_sequence
 
@@ -96,6 +96,7 @@ class ProjectorNode(RigNode):
         self._halted = threading.Event()
         self._showing = ""
         self._last_id = 0
+        self._calibrated_ns = 0
         self._last_run = time.monotonic()
         self._status: ProjectorStatus | None = None
         self._triggers = self.create_publisher(PatternTrigger, "projector/trigger", EVENTS)
@@ -189,6 +190,10 @@ class ProjectorNode(RigNode):
             self._link.lost(driver, error)
 
     def _on_calibration(self, message: RigCalibration) -> None:
+        """Take the calibration that came in force last; several nodes latch one."""
+        if (stamp_ns := stamp_from_msg(message.header.stamp)) < self._calibrated_ns:
+            return
+        self._calibrated_ns = stamp_ns
         info = message.projector
         info.header.frame_id = PROJECTOR_FRAME
         info.header.stamp = message.header.stamp

@@ -157,12 +157,13 @@ class ReconstructNode(RigNode):
         """Whether a scan could be made."""
         level, message = "ok", "ready"
         if not self._workshop.calibration_hash:
-            level, message = "error", self._calibration_fault
+            level, message = ("error" if self._file else "warn"), self._calibration_fault
         elif not self._ready:
             level, message = "warn", "compiling; scans wait"
         values: dict[str, object] = {
             "calibration": self._workshop.calibration_hash,
             "settings": self._workshop.settings_hash,
+            "compiled": self._ready,
             "last stack": self._last,
             "scanning": self._scanning.locked(),
         }
