@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from sl_bringup.report import micrometres, write_json, write_page
 from sl_bringup.scan_files import write_scan
 from sl_reconstruct.cloud import CLOUD_DTYPE, Cloud
+from sl_reconstruct.cloud_files import cloud_hash
 from sl_reconstruct.groove import Groove, measure_groove
 from sl_reconstruct.reasons import Reason
 
@@ -77,7 +77,7 @@ def write_result(
 
 def check_cloud(points: NDArray[Any], report: Mapping[str, Any]) -> str:
     """Empty when the cloud is the one that the report is about, else what is wrong."""
-    found = hashlib.sha256(np.ascontiguousarray(points).data.cast("B")).hexdigest()
+    found = cloud_hash(points)
     if found == report["cloud_hash"]:
         return ""
     return f"cloud received has the hash {found[:12]}, the report {report['cloud_hash'][:12]}"

@@ -1,0 +1,146 @@
+"""The commands as a user gives them: up, scan, doctor, a crash, Ctrl-C; with real processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from plyfile import PlyData
+
+from sl_bringup.graph_config import NODES
+from sl_bringup.transport import process_environment
+
+SLRIG = (sys.executable, "-m", "sl_bringup.cli")
+#: The first start on a machine compiles for a minute or two.
+READY_PATIENCE_S = 280.0
+
+pytestmark = pytest.mark.xdist_group("graph")
+
+
+class Command:
+    """A running ``slrig`` whose output is collected."""
+
+    def __init__(self, *arguments: str) -> None:
+        self._process = subprocess.Popen(
+            (*SLRIG, *arguments),
+            env=process_environment({"PYTHONPATH": os.pathsep.join(sys.path)}),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self.lines: list[str] = []
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout
+        self.lines.extend(line.rstrip() for line in iter(self._process.stdout.readline, ""))
+
+    @property
+    def text(self) -> str:
+        return "\n".join(self.lines)
+
+    def wait_for(self, text: str, patience_s: float, times: int = 1) -> None:
+        end_s = time.monotonic() + patience_s
+        while self.text.count(text) < times:
+            assert self._process.poll() is None, f"ended before it said {text!r}:\n{self.text}"
+            assert time.monotonic() < end_s, f"did not say {text!r}:\n{self.text}"
+            time.sleep(0.05)
+
+    def end(self, number: signal.Signals | None = None, patience_s: float = 60.0) -> int:
+        if number:
+            self._process.send_signal(number)
+        try:
+            return self._process.wait(patience_s)
+        finally:
+            self._process.kill()
+            self._process.wait()
+            self._reader.join()
+            self._process.stdout.close()  # type: ignore[union-attr]
+
+    def pid_of(self, name: str) -> int:
+        started = [line for line in self.lines if line.startswith(f"[{name}-") and "pid [" in line]
+        return int(started[-1].rpartition("[")[2].rstrip("]"))
+
+
+@pytest.fixture(scope="module")
+def graph(ros_domain: int) -> Iterator[Command]:
+    command = Command("up", "--bench", "--surface", "groove", "--domain", f"{ros_domain}")
+    try:
+        command.wait_for("graph ready", READY_PATIENCE_S)
+        yield command
+    finally:
+        command.end(signal.SIGINT)
+
+
+def scan(output: Path, *arguments: str) -> tuple[int, dict[str, object], str]:
+    command = Command("scan", "--output", str(output), "--no-pictures", *arguments)
+    status = command.end(patience_s=120.0)
+    file = output / "report.json"
+    return status, json.loads(file.read_text()) if file.is_file() else {}, command.text
+
+
+def test_a_scan_of_the_groove(graph: Command, tmp_path: Path) -> None:
+    """The bench's groove has 155.92 degrees; `paper` promises it within 0.05."""
+    status, report, told = scan(tmp_path, "--sequence", "paper", "--measure", "groove")
+    assert status == 0, told
+    assert report["good"]
+    assert report["groove"]["included_angle_deg"] == pytest.approx(155.92, abs=0.05)  # type: ignore[index]
+    assert report["points"] == report["lit_positions"] - sum(report["refused"].values())  # type: ignore[attr-defined]
+    assert PlyData.read(tmp_path / "cloud.ply")["vertex"].count == report["points"]
+    assert {"cloud.ply", "cloud.pcd", "height.tiff", "height.png", "report.json"} <= {
+        file.name for file in tmp_path.iterdir()
+    }
+    assert f"{report['points']:,} of" in told
+
+
+def test_a_sequence_that_does_not_exist_is_refused(graph: Command, tmp_path: Path) -> None:
+    status, report, told = scan(tmp_path, "--sequence", "zebra")
+    assert status == 1
+    assert not report["good"]
+    assert "zebra" in told
+    assert not (tmp_path / "cloud.ply").exists()
+
+
+def test_a_node_that_is_killed_comes_back_and_scans_go_on(graph: Command, tmp_path: Path) -> None:
+    before = graph.text.count("camera connected")
+    os.kill(graph.pid_of("camera"), signal.SIGKILL)
+    graph.wait_for("camera connected", 60.0, times=before + 1)
+    status, _, told = scan(tmp_path, "--sequence", "paper")
+    assert status == 0, told
+
+
+def test_the_doctor_sees_the_graph(graph: Command, ros_domain: int) -> None:
+    command = Command("doctor", "--bench", "--domain", f"{ros_domain}")
+    assert command.end() == 0, command.text
+    assert "running and ready" in command.text
+
+
+def test_a_second_graph_in_the_domain_is_refused(graph: Command, ros_domain: int) -> None:
+    command = Command("up", "--bench", "--domain", f"{ros_domain}")
+    assert command.end() == 1
+    assert "runs already" in command.text
+
+
+def test_ctrl_c_ends_everything_cleanly(graph: Command) -> None:
+    """The last test of the graph: it takes it down."""
+    pids = [graph.pid_of(name) for name in ("bench", *NODES)]
+    assert graph.end(signal.SIGINT) == 0, graph.text
+    assert graph.text.count("process has finished cleanly") == len(pids)
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+
+
+def test_without_a_graph_the_scan_says_what_to_do(ros_domain: int, tmp_path: Path) -> None:
+    status, _, told = scan(tmp_path, "--domain", f"{ros_domain}")
+    assert status == 1
+    assert "slrig up" in told
