@@ -25,6 +25,8 @@ MISSING_COLOUR = "#d9d9d9"
 ABSENT_COLOUR = "#f6d9c4"
 #: Above so many rows a single pixel of a picture is lost, and shown enlarged.
 ENLARGE_ABOVE_ROWS = 400
+#: Where more than this part is refused, enlarged ones would hide the points between them.
+ENLARGE_BELOW = 0.03
 #: Distinguishable for colour-blind readers (Okabe and Ito, 2008); grey is "not lit".
 REASON_COLOURS = (
     "#E69F00", "#56B4E9", "#D55E00", "#CC79A7", "#0072B2", "#F0E442", "#7A4FA3", "#8C510A",
@@ -138,9 +140,13 @@ def refusal_picture(
 
 def _enlarged(reasons: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Let each refused position of a large map cover its neighbours that are present."""
-    if len(reasons) < ENLARGE_ABOVE_ROWS:
+    refused = np.where(reasons > 1, reasons, 0)
+    if (
+        len(reasons) < ENLARGE_ABOVE_ROWS
+        or np.count_nonzero(refused) > ENLARGE_BELOW * refused.size
+    ):
         return reasons
-    spread = ndimage.maximum_filter(np.where(reasons > 1, reasons, 0), size=5)
+    spread = ndimage.maximum_filter(refused, size=5)
     return np.where((reasons == 0) & (spread > 0), spread, reasons)
 
 
