@@ -1,0 +1,324 @@
+"""Sub-pixel holes: a blurred elliptic step is fitted to the pixels around each hole's edge.
+
+Model of a pixel at x: ``D + (P0 + P1 q1 + P2 q2 - D) Phi(d / s)`` with ``q = M (x - c)``, which
+maps the ellipse on the unit circle, and ``d = (|q| - 1) / |grad |q||`` the distance from the edge
+(to first order; exact for a circle). c centre, M symmetric (3 numbers), s blur, D level in the
+hole, P0..P2 level of the plate and its slope: uneven light does not move the centre. Least
+squares over the pixels, weighted by the noise found on each side, is the matched filter of every
+edge point and the ellipse fit in one, and its normal equations give the covariance.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+#: c (2), M (uu, uv, vv), s, D, P0, P1, P2.
+PARAMETERS = 10
+CENTRE, SHAPE, BLUR, DARK, BRIGHT = 0, 2, 5, 6, 7
+
+#: Pixels are used to this many blurs on both sides of the edge: the step's tails end there.
+REACH_BLURS = 4.0
+#: Reach of the first pass, before the blur is known, px.
+FIRST_REACH_PX = 5.0
+MIN_REACH_PX = 2.0
+#: Share of the way to the next hole's edge, and of the smaller semi-axis, that pixels may take.
+REACH_SHARE = 0.45
+#: Residuals beyond this many sigmas lose weight (Huber).
+HUBER = 2.5
+PASSES = 2
+ITERATIONS = 12
+#: A step that lowers the cost (half of a chi-square) by less is the last: 0.1 sigma.
+DONE = 5e-3
+#: Largest part of a semi-axis that a centre may move from where the spot was.
+MAX_SHIFT = 0.5
+#: Least noise variance: that of rounding to whole numbers.
+MIN_VARIANCE = 1.0 / 12.0
+
+
+class HoleFits(NamedTuple):
+    """N fits, NaN where one failed.
+
+    ``centres_px`` (N, 2) of the ellipses, ``shapes_px2`` (N, 2, 2) as in `Blobs`,
+    ``covariance_px2`` (N, 2, 2) of the centres, ``blur_px`` (N,), ``contrast`` (N,) DN,
+    ``misfit`` (N,): rms residual over contrast; ``chi2`` (N,): of the residuals on the edge over
+    those beside it, 1 for a clean edge.
+    """
+
+    centres_px: Array
+    shapes_px2: Array
+    covariance_px2: Array
+    blur_px: Array
+    contrast: Array
+    misfit: Array
+    saturated: Array
+
+
+def fit_holes(
+    image: Image, centres_px: Array, shapes_px2: Array, gap_px: Array, saturation: float
+) -> HoleFits:
+    """Fit the edges of dark holes.
+
+    Parameters
+    ----------
+    image : ndarray, (H, W) float32
+        Dark holes on a bright plate, DN.
+    centres_px, shapes_px2 : ndarray, (N, 2) and (N, 2, 2)
+        Start: to a quarter of a radius.
+    gap_px : ndarray, (N,)
+        Bright plate between a hole and its next neighbour.
+    saturation : float
+        Level at which the sensor is full, in the units of the image; inf for none.
+    """
+    count = len(centres_px)
+    start = np.zeros((count, PARAMETERS))
+    start[:, CENTRE : CENTRE + 2] = centres_px
+    start[:, SHAPE : SHAPE + 3] = _inverse_root(shapes_px2)
+    small = np.sqrt(np.linalg.eigvalsh(shapes_px2)[:, 0])
+    reach = np.clip(REACH_SHARE * np.minimum(gap_px, 2.0 * small), MIN_REACH_PX, None)
+    out = np.full((count, PARAMETERS), np.nan)
+    covariance = np.full((count, 2, 2), np.nan)
+    quality = np.full((count, 2), np.nan)
+    _fit_all(image, start, reach, float(saturation), out, covariance, quality)
+    m = out[:, [SHAPE, SHAPE + 1, SHAPE + 1, SHAPE + 2]].reshape(-1, 2, 2)
+    failed = ~np.isfinite(out[:, 0])
+    m[failed] = np.eye(2)
+    shapes = np.linalg.inv(m @ m)
+    shapes[failed] = np.nan
+    contrast = out[:, BRIGHT] - out[:, DARK]
+    return HoleFits(
+        out[:, :2], shapes, covariance, out[:, BLUR], contrast, quality[:, 0], quality[:, 1]
+    )
+
+
+def _inverse_root(shapes_px2: Array) -> Array:
+    """(uu, uv, vv) of S^-1/2 for shapes S (N, 2, 2): (N, 3)."""
+    values, vectors = np.linalg.eigh(shapes_px2)
+    root = np.einsum("nij,nj,nkj->nik", vectors, 1 / np.sqrt(values), vectors)
+    return np.asarray(root[:, [0, 0, 1], [0, 1, 1]])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fit_all(
+    image: Any, start: Any, reach: Any, saturation: float, out: Any, covariance: Any, quality: Any
+) -> None:
+    for k in range(start.shape[0]):
+        p = start[k].copy()
+        limit = min(reach[k], FIRST_REACH_PX)
+        good = True
+        for _ in range(PASSES):
+            good = good and _fit(image, p, limit, start[k], covariance[k], quality[k])
+            if not good:
+                break
+            limit = min(reach[k], max(REACH_BLURS * p[BLUR], MIN_REACH_PX))
+        if good:
+            out[k] = p
+            quality[k, 1] = _saturated_share(image, p, limit, saturation)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _distance(p: Any, x: float, y: float) -> Any:
+    """Return (q1, q2, |q|, |grad |q||) of a pixel."""
+    dx, dy = x - p[0], y - p[1]
+    q1, q2 = p[2] * dx + p[3] * dy, p[3] * dx + p[4] * dy
+    rho = max(math.sqrt(q1 * q1 + q2 * q2), 1e-9)
+    g1, g2 = p[2] * q1 + p[3] * q2, p[3] * q1 + p[4] * q2
+    return q1, q2, rho, max(math.sqrt(g1 * g1 + g2 * g2) / rho, 1e-9)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _window(p: Any, limit: float, shape: Any) -> Any:
+    """Rows and columns of pixels within reach; ok is False where they leave the image."""
+    det = p[2] * p[4] - p[3] * p[3]
+    if not det > 1e-12:
+        return 0, 0, 0, 0, False
+    # semi-extents of the ellipse along u and v: rows of M^-1
+    wide = math.sqrt(p[4] * p[4] + p[3] * p[3]) / det + limit
+    high = math.sqrt(p[2] * p[2] + p[3] * p[3]) / det + limit
+    u0, u1 = math.floor(p[0] - wide), math.ceil(p[0] + wide)
+    v0, v1 = math.floor(p[1] - high), math.ceil(p[1] + high)
+    return u0, u1, v0, v1, u0 >= 0 and v0 >= 0 and u1 < shape[1] and v1 < shape[0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gather(image: Any, p: Any, limit: float) -> Any:
+    """Pixels (K, 3) = (u, v, level) within reach of the edge; none where the image ends."""
+    u0, u1, v0, v1, inside = _window(p, limit, image.shape)
+    if not inside or (u1 - u0) * (v1 - v0) > 400000:
+        return np.empty((0, 3))
+    pixels = np.empty(((u1 - u0 + 1) * (v1 - v0 + 1), 3))
+    count = 0
+    for v in range(v0, v1 + 1):
+        for u in range(u0, u1 + 1):
+            _, _, rho, steep = _distance(p, u, v)
+            if abs(rho - 1.0) <= limit * steep:
+                pixels[count, 0], pixels[count, 1], pixels[count, 2] = u, v, image[v, u]
+                count += 1
+    return pixels[:count]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _start_levels(pixels: Any, p: Any, limit: float) -> None:
+    """Put the mean levels on both sides, and a blur of 1 px, into the parameters."""
+    sums = np.zeros((2, 2))
+    for k in range(pixels.shape[0]):
+        _, _, rho, steep = _distance(p, pixels[k, 0], pixels[k, 1])
+        d = (rho - 1.0) / steep
+        if abs(d) > 0.5 * limit:
+            side = 1 if d > 0 else 0
+            sums[side, 0] += pixels[k, 2]
+            sums[side, 1] += 1.0
+    p[BLUR] = 1.0
+    p[DARK] = sums[0, 0] / max(sums[0, 1], 1.0)
+    p[BRIGHT] = sums[1, 0] / max(sums[1, 1], 1.0)
+    p[BRIGHT + 1], p[BRIGHT + 2] = 0.0, 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _model(p: Any, x: float, y: float, row: Any) -> Any:
+    """Level of a pixel; its derivatives go to ``row``. Returns (level, Phi)."""
+    q1, q2, rho, steep = _distance(p, x, y)
+    dx, dy = x - p[0], y - p[1]
+    t = (rho - 1.0) / (steep * p[BLUR])
+    phi = 0.5 * math.erfc(-t * 0.7071067811865476)
+    bright = p[BRIGHT] + p[BRIGHT + 1] * q1 + p[BRIGHT + 2] * q2
+    step = bright - p[DARK]
+    by_d = step * 0.3989422804014327 * math.exp(-0.5 * t * t) / p[BLUR]
+    by_rho = by_d / (steep * rho)
+    row[0] = -by_rho * (p[2] * q1 + p[3] * q2)
+    row[1] = -by_rho * (p[3] * q1 + p[4] * q2)
+    row[2], row[3], row[4] = by_rho * q1 * dx, by_rho * (q1 * dy + q2 * dx), by_rho * q2 * dy
+    row[BLUR] = -by_d * t
+    row[DARK] = 1.0 - phi
+    row[BRIGHT], row[BRIGHT + 1], row[BRIGHT + 2] = phi, phi * q1, phi * q2
+    return p[DARK] + step * phi, phi
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _noise(pixels: Any, p: Any, row: Any) -> Any:
+    """Variances in the hole and on the plate, from the residuals beside the edge."""
+    sums = np.zeros((2, 2))
+    for k in range(pixels.shape[0]):
+        level, phi = _model(p, pixels[k, 0], pixels[k, 1], row)
+        if phi < 0.02 or phi > 0.98:
+            side = 1 if phi > 0.5 else 0
+            sums[side, 0] += (pixels[k, 2] - level) ** 2
+            sums[side, 1] += 1.0
+    whole = (sums[0, 0] + sums[1, 0] + 1e-3) / max(sums[0, 1] + sums[1, 1], 1.0)
+    dark = sums[0, 0] / sums[0, 1] if sums[0, 1] >= 12.0 else whole
+    bright = sums[1, 0] / sums[1, 1] if sums[1, 1] >= 12.0 else whole
+    return max(dark, MIN_VARIANCE), max(bright, MIN_VARIANCE)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _normal(pixels: Any, p: Any, noise: Any, row: Any, a: Any, b: Any) -> Any:
+    """Weighted normal equations; returns the cost (Huber) and the plain sums."""
+    a[:] = 0.0
+    b[:] = 0.0
+    cost, squares = 0.0, 0.0
+    for k in range(pixels.shape[0]):
+        level, phi = _model(p, pixels[k, 0], pixels[k, 1], row)
+        r = pixels[k, 2] - level
+        variance = noise[0] + (noise[1] - noise[0]) * phi
+        z = abs(r) / math.sqrt(variance)
+        weight = (1.0 if z < HUBER else HUBER / z) / variance
+        cost += 0.5 * z * z if z < HUBER else HUBER * (z - 0.5 * HUBER)
+        squares += r * r
+        for i in range(PARAMETERS):
+            b[i] += weight * row[i] * r
+            for j in range(i + 1):
+                a[i, j] += weight * row[i] * row[j]
+    for i in range(PARAMETERS):
+        for j in range(i):
+            a[j, i] = a[i, j]
+    return cost, squares
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sane(p: Any, start: Any) -> Any:
+    """Whether parameters are still those of the hole that the fit was started on."""
+    shift = math.hypot(p[0] - start[0], p[1] - start[1]) * math.sqrt(
+        abs(start[2] * start[4] - start[3] * start[3])
+    )
+    det = p[2] * p[4] - p[3] * p[3]
+    was = start[2] * start[4] - start[3] * start[3]
+    return (
+        shift < MAX_SHIFT
+        and p[BLUR] > 0.1
+        and p[BLUR] < 20.0
+        and p[2] + p[4] > 0.0
+        and det > was / 4.0
+        and det < was * 4.0
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _descend(pixels: Any, p: Any, noise: Any, row: Any, a: Any, b: Any, start: Any) -> Any:
+    """Levenberg-Marquardt on the parameters in place; returns the sum of squares, a as at p."""
+    cost, squares = _normal(pixels, p, noise, row, a, b)
+    trial_a, trial_b = np.empty_like(a), np.empty_like(b)
+    damping = 1e-4
+    for _ in range(ITERATIONS):
+        damped = a.copy()
+        for i in range(PARAMETERS):
+            damped[i, i] += damping * a[i, i] + 1e-12
+        trial = p + np.linalg.solve(damped, b)
+        if _sane(trial, start):
+            trial_cost, trial_squares = _normal(pixels, trial, noise, row, trial_a, trial_b)
+            if trial_cost <= cost:
+                done = cost - trial_cost < DONE
+                p[:], a[:], b[:] = trial, trial_a, trial_b
+                cost, squares = trial_cost, trial_squares
+                damping *= 0.1
+                if done:
+                    break
+                continue
+        damping *= 10.0
+        if damping > 1e6:
+            break
+    return squares
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fit(image: Any, p: Any, limit: float, start: Any, covariance: Any, quality: Any) -> Any:
+    """One pass: gather pixels, find the noise, descend; False where there is no hole."""
+    pixels = _gather(image, p, limit)
+    if pixels.shape[0] < 3 * PARAMETERS:
+        return False
+    if p[BLUR] == 0.0:
+        _start_levels(pixels, p, limit)
+    if not p[BRIGHT] - p[DARK] > 1.0:
+        return False
+    row, a, b = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    noise = _noise(pixels, p, row)
+    squares = _descend(pixels, p, noise, row, a, b, start)
+    contrast = p[BRIGHT] - p[DARK]
+    if not (contrast > 1.0 and _sane(p, start)):
+        return False
+    for i in range(PARAMETERS):
+        a[i, i] += 1e-12 * (1.0 + a[i, i])
+    inverse = np.linalg.inv(a)
+    covariance[:] = inverse[:2, :2]
+    quality[0] = math.sqrt(squares / pixels.shape[0]) / contrast
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _saturated_share(image: Any, p: Any, limit: float, saturation: float) -> float:
+    """Share of the plate's pixels beside the edge that are at the top of the scale."""
+    pixels = _gather(image, p, limit)
+    full, count = 0, 0
+    for k in range(pixels.shape[0]):
+        _, _, rho, steep = _distance(p, pixels[k, 0], pixels[k, 1])
+        if rho - 1.0 > 0.5 * limit * steep:
+            count += 1
+            if pixels[k, 2] >= saturation:
+                full += 1
+    return full / max(count, 1)

@@ -1,0 +1,167 @@
+"""Which hole of the plate is which: rotation, offset and side of a found lattice.
+
+Every way to lay the plate's holes on the found lattice is scored by what it leaves unexplained:
+holes that should be in view but are not there, and a mark where there should be none.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_calibration.plate import Plate
+from sl_projector.errors import CalibrationError
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+#: A mark missing where it should be, or found where none should be, weighs as many lost holes.
+MARK_WEIGHT = 4
+#: Turning the plate over must explain this many holes more than leaving it.
+SIDE_MARGIN = 2
+
+_ROTATIONS = [
+    np.array([[c, -s], [s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))
+]  # fmt: skip
+_MIRROR = np.diag([1, -1])
+
+
+@dataclass(frozen=True)
+class Placement:
+    """(column, row) = turn @ (i, j) + shift, its score and whether the plate shows its back."""
+
+    turn: Ids
+    shift: Ids
+    unexplained: int
+    mirrored: bool
+
+    def ids(self, lattice: Ids) -> Ids:
+        """(column, row) of lattice points (N, 2)."""
+        return np.asarray(lattice @ self.turn.T + self.shift)
+
+
+@dataclass(frozen=True)
+class FoundLattice:
+    """A lattice in the image.
+
+    Parameters
+    ----------
+    ij : ndarray, (N, 2) int
+        Lattice points that were found.
+    marks : ndarray, (N,) bool
+        Those of the size of the origin mark.
+    lattice_to_image : ndarray, (3, 3)
+        Homography from (i, j) to pixels.
+    image_size : tuple of int
+        (width, height).
+    margin_px : float
+        A hole centred nearer than this to the image's border may be cut.
+    """
+
+    ij: Ids
+    marks: NDArray[np.bool_]
+    lattice_to_image: Array
+    image_size: tuple[int, int]
+    margin_px: float
+
+    def pixels(self, ij: Array | Ids) -> Array:
+        """Image points (N, 2) of lattice points (N, 2)."""
+        local = ij @ self.lattice_to_image[:, :2].T + self.lattice_to_image[:, 2]
+        return np.asarray(local[..., :2] / local[..., 2:])
+
+    def in_view(self, ij: Array | Ids) -> NDArray[np.bool_]:
+        """Whether holes at lattice points (N, 2) lie wholly in the image."""
+        local = ij @ self.lattice_to_image[:, :2].T + self.lattice_to_image[:, 2]
+        q, last = self.pixels(ij), np.array(self.image_size) - 1 - self.margin_px
+        inside = np.all((q > self.margin_px) & (q < last), axis=-1)
+        return np.asarray(inside & (local[..., 2] * self.lattice_to_image[2, 2] > 0))
+
+
+def place(plate: Plate, found: FoundLattice) -> Placement:
+    """Lay the plate on the lattice.
+
+    Without a mark, of the rotations that explain the image equally well the one is taken whose
+    plate x is nearest to image right; a corner mark on a square plate leaves no doubt but that of
+    the side, and the front is taken.
+
+    Raises
+    ------
+    CalibrationError
+        When the lattice does not fit on the plate, more than one offset explains it equally well,
+        or the plate shows its back.
+    """
+    options = [option for turn, mirrored in _turns(found) for option in _shifts(plate, found, turn,
+               mirrored)]  # fmt: skip
+    if not options:
+        extent = np.ptp(found.ij, axis=0) + 1
+        raise CalibrationError(
+            f"found a lattice of {extent[0]} x {extent[1]} holes; "
+            f"expected at most {plate.columns} x {plate.rows}"
+        )
+    front = min((o.unexplained for o in options if not o.mirrored), default=10**6)
+    best = min(options, key=lambda o: o.unexplained)
+    if best.mirrored and best.unexplained + SIDE_MARGIN <= front:
+        raise CalibrationError(
+            f"the plate is turned over: its mark lies where only the back shows it; "
+            f"expected the front, with the mark at hole {plate.origin_id}"
+        )
+    level = [o for o in options if not o.mirrored and o.unexplained == front]
+    return _upright(found, level)
+
+
+def _turns(found: FoundLattice) -> list[tuple[Ids, bool]]:
+    """Return the eight turns of a square, with whether each shows the plate's back.
+
+    Plate y is up where image v is down: the front's map to the image has a negative determinant.
+    """
+    middle = found.ij.mean(axis=0)
+    corner = found.pixels(middle + np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]]))
+    d = corner[1:] - corner[0]
+    flipped = d[0, 0] * d[1, 1] - d[0, 1] * d[1, 0] > 0
+    turns = [(rotation, bool(flipped)) for rotation in _ROTATIONS]
+    return turns + [(rotation @ _MIRROR, not flipped) for rotation in _ROTATIONS]
+
+
+def _shifts(plate: Plate, found: FoundLattice, turn: Ids, mirrored: bool) -> list[Placement]:
+    """Score all offsets of one turn that keep the lattice on the plate."""
+    turned = found.ij @ turn.T
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    spare = np.array([plate.columns, plate.rows]) - (high - low + 1)
+    if spare.min() < 0:
+        return []
+    offsets = itertools.product(range(spare[0] + 1), range(spare[1] + 1))
+    shifts = [np.array(offset) - low for offset in offsets]
+    return [Placement(turn, s, _unexplained(plate, found, turn, s), mirrored) for s in shifts]
+
+
+def _unexplained(plate: Plate, found: FoundLattice, turn: Ids, shift: Ids) -> int:
+    whole = np.stack(np.meshgrid(range(plate.columns), range(plate.rows)), axis=-1).reshape(-1, 2)
+    ij = (whole - shift) @ turn  # the inverse of a turn is its transpose
+    seen = {tuple(k) for k in found.ij.tolist()}
+    there = np.array([tuple(k) in seen for k in ij.tolist()])
+    lost = int(np.sum(found.in_view(ij) & ~there))
+    if plate.origin_diameter_m is None:
+        return lost
+    at_origin = np.all(found.ij @ turn.T + shift == plate.origin_id, axis=1)
+    return lost + MARK_WEIGHT * int(np.sum(at_origin != found.marks))
+
+
+def _upright(found: FoundLattice, level: list[Placement]) -> Placement:
+    """Take the placement whose x is nearest to image right; refuse when offsets remain."""
+    middle = found.ij.mean(axis=0)
+
+    def right(option: Placement) -> float:
+        step = found.pixels(middle + option.turn[0]) - found.pixels(middle)  # one column on
+        return float(step[0] / np.hypot(*step))
+
+    best = max(level, key=right)
+    rivals = [o for o in level if np.array_equal(o.turn, best.turn)]
+    if len(rivals) > 1:
+        raise CalibrationError(
+            f"part of the plate is out of view and its holes fit at {len(rivals)} offsets; "
+            f"expected the origin mark or two neighbouring sides of the plate in view"
+        )
+    return best
