@@ -292,7 +292,8 @@ def test_a_stack_that_nobody_asked_for_becomes_a_cloud(works: Works) -> None:
         (lambda: with_fields(patterns=[PatternMsg(kind="sine")]), "sine"),
         (lambda: with_fields(stamps=[]), "0 stamps"),
         (disordered, "stamps"),
-        (exchanged, ""),
+        (exchanged, "image"),
+        (lambda: with_fields(data=bytes(frames("precise").size)), "no points"),
     ],
 )
 def test_a_bad_stack_is_refused_with_a_word_and_the_next_one_is_right(

@@ -49,6 +49,7 @@ from sl_reconstruct.messages import (
     rig_to_msg,
     stack_from_msg,
 )
+from sl_reconstruct.quality import verdict
 from sl_reconstruct.scan_flow import (
     ScanFailed,
     ScanOrder,
@@ -59,7 +60,7 @@ from sl_reconstruct.scan_flow import (
     ScanWatch,
 )
 from sl_reconstruct.settings import Settings
-from sl_reconstruct.workshop import Workshop
+from sl_reconstruct.workshop import Workshop, compile_apart, compiled, warm_up
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -110,6 +111,7 @@ class ReconstructNode(RigNode):
         self.subscribe(PatternStack, "synchronizer/stack", self._on_stack, LARGE)
         self._offer_scan()
         self.add_on_set_parameters_callback(self._on_parameters)
+        self._compiler = None if compiled() else compile_apart()
         self._worker.submit(self._warm_up)
 
     def _offer_scan(self) -> None:
@@ -171,16 +173,27 @@ class ReconstructNode(RigNode):
 
     def close(self) -> None:
         """Let the stack that is being worked on end, forget the others."""
+        self._stop_compiler()
         self._worker.shutdown(wait=True, cancel_futures=True)
+        self._stop_compiler()
         self._action.destroy()
         super().close()
+
+    def _stop_compiler(self) -> None:
+        if self._compiler is not None:
+            self._compiler.terminate()
+            self._compiler.wait()
 
     def _warm_up(self) -> None:
         """Compile before the first stack comes; then the calibration, so that ready means ready."""
         if self._file:
             self._read_calibration()
         try:
-            self._workshop.warm_up()
+            if self._compiler is not None:
+                self._compiler.wait()
+            if self.context.ok():
+                warm_up()
+                self._compiler = compile_apart(rest=True)
         except Exception as error:  # the first real stack will say it again
             self.get_logger().error(f"warm-up failed: {error!r}")
         self._ready = True
@@ -301,6 +314,9 @@ class ReconstructNode(RigNode):
         # The images are let go before the cloud is published, which needs as much memory again.
         product = self._workshop(stack.take_images(), stack.sequence)
         computed_s = time.perf_counter() - began_s
+        good, reasons = verdict(product.cloud)
+        if not good:
+            raise ScanFailed(f"no cloud is published: {'; '.join(reasons)}")
         self._clouds.publish(cloud_to_msg(product.cloud.points, stack.stamps_ns[0], WORLD_FRAME))
         done_ns = time.time_ns()
         report = report_to_msg(product, stack)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 from collections import OrderedDict
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,8 +21,8 @@ from sl_reconstruct.reconstruct import Reconstructor
 from sl_reconstruct.rig import Device, Division, Rig
 from sl_reconstruct.settings import Settings
 
-#: Sequences whose scratch memory is kept.
-MAX_SEQUENCES = 2
+#: Sequences whose reconstructor, with its scratch memory, is kept.
+MAX_SEQUENCES = 1
 _TINY_CAMERA, _TINY_DMD = (64, 16), (32, 24)
 
 
@@ -92,12 +96,41 @@ class Workshop:
             self._made.popitem(last=False)
         return self._made[key]
 
-    def warm_up(self) -> None:
-        """Compile, or load from the cache, what the first stack would wait for."""
-        for dtype in (np.uint8, np.uint16):
-            sequence = named("precise", _TINY_DMD)
-            stack = np.zeros((len(sequence), *_TINY_CAMERA[::-1]), dtype)
-            Reconstructor(tiny_rig(), sequence, self.settings)(stack)
+
+def warm_up(rest: bool = False) -> None:
+    """Compile, or load from the cache, what the first stack would wait for.
+
+    Parameters
+    ----------
+    rest : bool
+        What most rigs do not need at once: row patterns and 16-bit images.
+    """
+    kinds = [("precise-rows", np.uint8), ("precise-rows", np.uint16)] if rest else []
+    for name, dtype in kinds or [("precise", np.uint8)]:
+        sequence = named(name, _TINY_DMD)
+        stack = np.zeros((len(sequence), *_TINY_CAMERA[::-1]), dtype)
+        Reconstructor(tiny_rig(), sequence)(stack)
+
+
+def compiled() -> bool:
+    """Tell whether the kernels seem to be in numba's cache: newer there than every source."""
+    package = Path(__file__).parent
+    cached = [file.stat().st_mtime for file in package.glob("__pycache__/*.nbi")]
+    return bool(cached) and max(cached) > max(f.stat().st_mtime for f in package.glob("*.py"))
+
+
+def compile_apart(rest: bool = False) -> subprocess.Popen[bytes]:
+    """Start another process that does `warm_up`, into numba's cache.
+
+    The compiler leaves 230 MB behind in the process that it ran in, for as long as that lives.
+    """
+    return subprocess.Popen(
+        [sys.executable, "-m", "sl_reconstruct.workshop", *(["rest"] if rest else [])],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
 
 
 def tiny_rig() -> Rig:
@@ -109,3 +142,9 @@ def tiny_rig() -> Rig:
         return Device(size, (400.0, 400.0), centre, 1e-5, down, np.array([x_m, 0, 0.1]), Division())
 
     return Rig(device(_TINY_CAMERA, 0.02), device(_TINY_DMD, -0.02))
+
+
+if __name__ == "__main__":
+    if "rest" in sys.argv[1:]:
+        os.nice(19)
+    warm_up("rest" in sys.argv[1:])
