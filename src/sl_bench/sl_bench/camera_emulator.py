@@ -198,7 +198,10 @@ class CameraEmulator:
         region = fields.pop("region", None)
         settings = CameraSettings(**fields, region=tuple(region) if region else None)
         if settings.pixel_format != self._pixel_format:
-            raise DeviceRefused(f"this sensor delivers {self._pixel_format} only")
+            raise DeviceRefused(
+                f"pixel_format={settings.pixel_format!r}; this sensor delivers "
+                f"{self._pixel_format} only"
+            )
         width, height = self._image_size
         if settings.region is not None:
             x, y, w, h = settings.region

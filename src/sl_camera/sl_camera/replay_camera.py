@@ -112,6 +112,8 @@ class ReplayCamera:
         DeviceRefused
             When the bag is at its end.
         """
+        if self._reader is None:
+            raise DeviceLost(f"{self._path} is not open")
         if self._armed and self._next is None:
             raise DeviceRefused(
                 f"the recording {self._path} is at its end after {self._taken} frames; expected "
@@ -131,6 +133,8 @@ class ReplayCamera:
         image = self._next
         if stamp_ns is None or image is None:
             return None
+        over_ns = stamp_ns + round(settings.exposure_s * 1e9)
+        time.sleep(max(0.0, (over_ns - time.time_ns()) * 1e-9))
         self._next = next(self._frames, None)
         self._taken += 1
         self._counts.received += 1
@@ -150,10 +154,9 @@ class ReplayCamera:
     # -- inside -----------------------------------------------------------------------------
 
     def _moment(self, settings: CameraSettings, timeout_s: float) -> int | None:
-        """When the next frame is exposed; None when it is not yet."""
+        """Start of the next frame's exposure; None when there is none in time."""
         if settings.trigger == "free":
-            time.sleep(min(settings.exposure_s, max(timeout_s, 0.0)))
-            return time.time_ns() - round(settings.exposure_s * 1e9)
+            return time.time_ns()
         try:
             return self._triggers.get(timeout=max(timeout_s, 0.0))
         except queue.Empty:
