@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_calibration.detect import detect_plate
+from sl_calibration.detect import find_plate
 from sl_calibration.views import View
-from sl_calibration.plate import Plate
 from sl_calibration.session import Order, Taken
 from sl_projector.errors import CalibrationError
 from sl_projector.sequence import Pattern, PatternSequence
@@ -33,7 +32,8 @@ def observe(taken: Taken, order: Order) -> View:
         projector's patterns are not seen on it.
     """
     check_light(taken.images, taken.sequence)
-    holes = detect_plate(white_image(taken.images, taken.sequence), order.plate)
+    full_dn = float(np.iinfo(taken.images.dtype).max)
+    holes = find_plate(white_image(taken.images, taken.sequence), order.plate, full_dn)
     targets = correspondences(taken.images, taken.sequence)
     if len(targets) < MIN_TARGETS:
         raise CalibrationError(
@@ -44,7 +44,7 @@ def observe(taken: Taken, order: Order) -> View:
     return View(
         taken.height_m,
         holes.ids[good], holes.plate_xy_m[good], holes.centres_px[good], holes.sigma_px[good],
-        targets.camera_px, targets.dmd_px, targets.sigma_px,
+        targets.camera_px, targets.dmd_px, targets.sigma_px, targets.edge_sigma_px,
     )  # fmt: skip
 
 

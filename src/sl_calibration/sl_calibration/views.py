@@ -45,6 +45,8 @@ class View:
         DMD column and row that light them.
     dmd_sigma_px : ndarray, (M, 2)
         Their 1-sigma.
+    edge_sigma_px : float
+        1-sigma of a single edge on this plate in this light, camera pixels.
     """
 
     height_m: float
@@ -55,6 +57,7 @@ class View:
     camera_px: Array
     dmd_px: Array
     dmd_sigma_px: Array
+    edge_sigma_px: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,8 @@ def load_observations(path: Path) -> Observations:
             views = [
                 {name: file[f"{name}_{i}"] for name in names} for i in range(int(about["views"]))
             ]
-        made = [View(**{**view, "height_m": float(view["height_m"])}) for view in views]
+        scalars = ("height_m", "edge_sigma_px")
+        made = [View(**{**v, **{name: float(v[name]) for name in scalars}}) for v in views]
         return Observations(
             tuple(made), _size(about["camera_size"]), _size(about["dmd_size"]),
             float(about["camera_pitch_m"]), float(about["dmd_pitch_m"]), about["made_from"],

@@ -46,11 +46,14 @@ class Correspondences:
         (column, row) seen there, DMD pixels, (0, 0) in the middle of the upper left mirror.
     sigma_px : ndarray, (N, 2)
         1-sigma of ``dmd_px`` from the scatter of the boundaries, DMD pixels.
+    edge_sigma_px : float
+        Median stated 1-sigma of a single column boundary, camera pixels; NaN where there is none.
     """
 
     camera_px: Array
     dmd_px: Array
     sigma_px: Array
+    edge_sigma_px: float = float("nan")
 
     def __len__(self) -> int:
         return len(self.camera_px)
@@ -108,7 +111,12 @@ def correspondences(
         grid[good],
         np.stack([column[good], row[good]], axis=1),
         np.stack([sigma_c[good], sigma_r[good]], axis=1),
+        _median(columns.sigma_px[columns.reason == 0]),
     )
+
+
+def _median(values: NDArray[np.float32]) -> float:
+    return float(np.median(values)) if values.size else float("nan")
 
 
 def _grid(width: int, height: int, step_px: int, half_px: int) -> Array:

@@ -1,0 +1,153 @@
+"""``slrig calibrate``: calibrate the rig with the running graph, or stored observations again."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import subprocess
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sl_bringup.graph import Graph, GraphOptions, client_command, client_environment, is_running
+from sl_bringup.progress import complain, say
+from sl_bringup.up import add_graph_arguments, graph_options, until_signal
+
+if TYPE_CHECKING:
+    from sl_calibration.calibrator import Outcome
+
+CLIENT = "sl_bringup.calibrate_node"
+INTERRUPTED = 130
+
+
+def add_parser(subparsers: Any) -> None:
+    """Register ``slrig calibrate``."""
+    parser = subparsers.add_parser(
+        "calibrate",
+        help="calibrate the rig on the hole plate",
+        description="Ask the graph to calibrate: the plate at several heights, camera and "
+        "projector, uncertainty, verdict, report. The exit status is 0 only when a calibration "
+        "was accepted and is in force. With --from, observations that were stored are solved "
+        "again, without a graph; nothing is put in force then.",
+        epilog="examples:\n"
+        "  slrig calibrate\n"
+        "  slrig calibrate --heights-mm -1 -0.5 0 0.5 1\n"
+        "  slrig calibrate --from calibrations/2026-01-31_120000_run --output again\n"
+        "  slrig calibrate --up --bench --surface hole_plate",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--from", dest="source", type=Path, metavar="DIR",
+        help="solve the observations in this run's folder again, offline",
+    )  # fmt: skip
+    parser.add_argument("--output", type=Path, metavar="DIR", help="with --from: for the results")
+    parser.add_argument(
+        "--heights-mm", type=float, nargs="+", default=[], metavar="Z",
+        help="stage heights of the views (default: the node's)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--target", choices=["both", "camera", "projector"], default="both", help="what to calibrate"
+    )
+    parser.add_argument("--sequence", default="", help="patterns, both axes (default: the node's)")
+    parser.add_argument(
+        "--verify", action="store_true", help="only check the calibration in force on the plate"
+    )
+    parser.add_argument(
+        "--timeout", type=float, default=600.0, metavar="S", help="for the run (default: 600)"
+    )
+    parser.add_argument(
+        "--up", action="store_true", help="start the graph for this run where none is running"
+    )
+    parser.add_argument(
+        "--ready-timeout", type=float, default=240.0, metavar="S",
+        help="with --up: for the graph to get ready (default: 240)",
+    )  # fmt: skip
+    add_graph_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def client_arguments(args: argparse.Namespace) -> list[str]:
+    """Arguments of the ROS client."""
+    words = ["--target", args.target, "--timeout", f"{args.timeout}"]
+    if args.sequence:
+        words += ["--sequence", args.sequence]
+    if args.heights_mm:
+        words += ["--heights-m", *(f"{height * 1e-3}" for height in args.heights_mm)]
+    return [*words, "--verify"] if args.verify else words
+
+
+async def calibrate_once(
+    options: GraphOptions, client: Sequence[str], ready_timeout_s: float, tell: Callable[[str], None]
+) -> int:
+    """Start a graph, calibrate, stop the graph; 0 only when all went well."""
+
+    async def work(graph: Graph) -> int:
+        if not await graph.ready(ready_timeout_s):
+            return 1
+        return await graph.run_client(CLIENT, *client)
+
+    async with Graph(options, tell) as graph:
+        status = await until_signal(work(graph))
+    if status is None:
+        return INTERRUPTED
+    for reason in graph.supervisor.unclean:
+        complain(f"slrig calibrate: at the end, {reason}")
+    return status or int(bool(graph.supervisor.unclean))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out ``slrig calibrate``."""
+    if args.source is not None:
+        return solve_again(args.source, args.output or args.source / "again")
+    options = graph_options(args)
+    client = client_arguments(args)
+    if args.up and not is_running(options.directory):
+        log = options.directory / "graph.log"
+        say(f"starting the graph{' on the bench' if options.bench else ''} (log: {log})")
+        with log.open("w") as file:
+            tell = _writer(file)
+            return asyncio.run(calibrate_once(options, client, args.ready_timeout, tell))
+    command = client_command(CLIENT, options, *client)
+    try:
+        return subprocess.run(
+            command, env=client_environment(options), check=False
+        ).returncode
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+def _writer(file: Any) -> Callable[[str], None]:
+    def tell(line: str) -> None:
+        file.write(line + "\n")
+
+    return tell
+
+
+def solve_again(source: Path, output: Path) -> int:
+    """Solve the observations of a stored run; nothing is put in force."""
+    from sl_calibration.calibrator import solve_stored
+
+    outcome = solve_stored(source, output)
+    for line in outcome_lines(outcome):
+        say(line)
+    return 0 if outcome.accepted else 1
+
+
+def outcome_lines(outcome: Outcome | Any) -> list[str]:
+    """Lines that tell a person what came out; of an `Outcome` or the action's result."""
+    lines = [outcome.message]
+    if outcome.views:
+        lines += [
+            f"views             {outcome.views}, {outcome.holes} holes",
+            f"camera            {outcome.camera_rms_px:.4f} px, "
+            f"{outcome.camera_rms_m * 1e6:.3f} um on the part (rms of the holes)",
+            f"projector         {outcome.projector_rms_px:.4f} px, "
+            f"{outcome.projector_rms_m * 1e6:.3f} um on the part (rms of the targets)",
+            f"sigma of z        {outcome.predicted_sigma_m * 1e6:.3f} um at worst in the volume",
+            f"left-out heights  {outcome.left_out_rms_m * 1e6:.3f} um rms of z",
+        ]
+    if outcome.calibration_file:
+        lines += [f"calibration       {outcome.calibration_file}", f"hash              {outcome.hash}"]
+    if outcome.report:
+        lines.append(f"report            {outcome.report}")
+    return lines

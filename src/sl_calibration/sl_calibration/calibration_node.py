@@ -1,0 +1,343 @@
+"""The calibration's node: calibrates the rig on request, checks it, and says what is in force.
+
+One run at a time, in a worker's thread; the executor's thread only hands over. A calibration that
+is not accepted, a run that fails or is cancelled, leave the one in force as it is.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from rclpy.action import ActionServer, CancelResponse
+from sl_interfaces.action import Calibrate as CalibrateAction
+from sl_interfaces.msg import RigCalibration
+from sl_interfaces.srv import Calibrate, Verify
+
+from sl_calibration.calibrator import Calibrator, Outcome, Pitches, VerifyOutcome
+from sl_calibration.gear_node import RigGear
+from sl_calibration.plate import Plate
+from sl_calibration.session import Order, Progress
+from sl_calibration.store import Store, default_directory
+from sl_calibration.uncertainty import Limits
+from sl_projector.base_node import (
+    CAMERA_FRAME,
+    LATCHED,
+    PROJECTOR_FRAME,
+    WORLD_FRAME,
+    Health,
+    RigNode,
+    run,
+)
+from sl_projector.errors import CalibrationError, SlError
+from sl_projector.messages import stamp_from_msg
+from sl_reconstruct.calibration_file import Calibration, load_calibration, parse_calibration
+from sl_reconstruct.messages import rig_to_msg
+from sl_reconstruct.scan_flow import ScanTimeouts
+
+FRAMES = (WORLD_FRAME, CAMERA_FRAME, PROJECTOR_FRAME)
+_HEIGHTS_M = [-1e-3, -0.5e-3, 0.0, 0.5e-3, 1e-3]
+
+
+class CalibrationNode(RigNode):
+    """Offers ``calibration/calibrate`` (service and action) and ``calibration/verify``."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("calibration", **options)
+        self._declare_parameters()
+        self._calibrator = self._make_calibrator()
+        self._gear = RigGear(self)
+        self._gear.timeouts = self._timeouts
+        self._gear.max_repeats = self._repeats
+        self._gear.move_timeout_s = self._move_timeout_s
+        self._running = threading.Lock()
+        self._in_force: Calibration | None = None
+        self._source = ""
+        self._since_ns = 0
+        self._fault = "not calibrated"
+        self._last = "no run yet"
+        self._rigs = self.create_publisher(RigCalibration, "calibration/rig", LATCHED)
+        self.subscribe(RigCalibration, "calibration/rig", self._on_rig, LATCHED)
+        self._load()
+        self._offer()
+
+    def _offer(self) -> None:
+        group = self.long_work
+        self.create_service(
+            Calibrate, "calibration/calibrate", self._serve, callback_group=group
+        )
+        self.create_service(
+            Verify, "calibration/verify", self._serve_verify, callback_group=group
+        )
+        self._action = ActionServer(
+            self,
+            CalibrateAction,
+            "calibration/calibrate",
+            self._execute,
+            callback_group=group,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+        )
+
+    # -- parameters -----------------------------------------------------------------------------
+
+    def _declare_parameters(self) -> None:
+        self._store = Store(Path(
+            self.declare("store_dir", "", "folder of calibrations; empty: the user's")
+            or default_directory()
+        ).expanduser())  # fmt: skip
+        self._file = self.declare(
+            "calibration_file", "", "in force at the start; empty: the last accepted in store_dir"
+        )
+        self.declare("heights_m", _HEIGHTS_M, "stage heights of the views, m", live=True)
+        self.declare("sequence", "precise-rows", "patterns, both axes", live=True)
+        self._declare_plate()
+        self._pitches = Pitches(
+            self.declare("camera_pitch_m", 11.4e-6, "pixel pitch, for reports, m", 3e-7, 2e-4),
+            self.declare("projector_pitch_m", 13.68e-6, "mirror pitch, for reports, m", 3e-7, 2e-4),
+        )
+        self._stage_tolerance_m = self.declare(
+            "stage_tolerance_m", 5e-6, "the stage stands where it was sent within, m", 1e-7, 1e-3
+        )
+        self._repeats = self.declare("max_repeats", 2, "how often a spoilt stack is repeated", 0, 9)
+        self._verify_limit_m = self.declare(
+            "verify_limit_m", 3e-6, "error beyond which verify says to recalibrate, m", 1e-8, 1e-2
+        )
+        self._limits = self._declare_limits()
+        self._declare_timeouts()
+
+    def _declare_plate(self) -> None:
+        plate = Plate()
+        self.declare("plate_columns", plate.columns, "holes along x", 3, 200, live=True)
+        self.declare("plate_rows", plate.rows, "holes along y", 3, 200, live=True)
+        self.declare("plate_pitch_m", plate.pitch_m, "pitch of the holes, m", 0.0, 1.0, live=True)
+        self.declare(
+            "plate_diameter_m", plate.diameter_m, "diameter of the holes, m", 0.0, 1.0, live=True
+        )
+        self.declare(
+            "plate_origin_diameter_m", 0.0, "diameter of the hole at the origin, m; 0: no mark",
+            0.0, 1.0, live=True,
+        )  # fmt: skip
+        self.declare(
+            "plate_chamfer_m", 0.0, "width of the holes' chamfers, m", 0.0, 1.0, live=True
+        )
+        self.declare(
+            "plate_dark_holes", True, "dark holes in a bright plate; false: bright dots", live=True
+        )
+
+    def _declare_limits(self) -> Limits:
+        """Limits of the acceptance gate, each a parameter of its own."""
+        values = {
+            item.name: self.declare(
+                f"limit_{item.name}", float(item.default), f"acceptance: largest {item.name}"
+            )
+            for item in fields(Limits)
+        }
+        return Limits(**values)
+
+    def _declare_timeouts(self) -> None:
+        default = ScanTimeouts()
+        self._timeouts = ScanTimeouts(
+            project_s=self.declare(
+                "project_timeout_s", default.project_s, "wait for the projector, s", 1.0, 3600.0
+            ),
+            silence_s=self.declare(
+                "silence_timeout_s", default.silence_s, "wait for the next frame, s", 0.1, 600.0
+            ),
+        )
+        self._move_timeout_s = self.declare(
+            "move_timeout_s", 120.0, "wait for the stage, s", 1.0, 3600.0
+        )
+
+    def _value(self, name: str) -> Any:
+        return self.get_parameter(name).value
+
+    def _make_calibrator(self) -> Calibrator:
+        return Calibrator(
+            self._store, self._limits, self._pitches, self._stage_tolerance_m, self._verify_limit_m
+        )
+
+    # -- the calibration in force -----------------------------------------------------------------
+
+    def _load(self) -> None:
+        """Put the named file, else the last accepted run, in force; a bad one is told."""
+        try:
+            path = Path(self._file) if self._file else self._store.current()
+            if path is None:
+                return
+            calibration = load_calibration(path)
+            since_ns = path.stat().st_mtime_ns if self._file else self._store.in_force_since_ns()
+            self._put_in_force(calibration, str(path), since_ns)
+        except (SlError, OSError) as error:
+            self._fault = str(error)
+            self.complain("stored calibration", error)
+
+    def _put_in_force(self, calibration: Calibration, source: str, since_ns: int) -> None:
+        self._in_force, self._source, self._since_ns = calibration, source, since_ns
+        self._rigs.publish(rig_to_msg(calibration, source, since_ns, FRAMES))
+        self.get_logger().info(f"calibration {calibration.hash[:12]} of {source} is in force")
+
+    def _on_rig(self, message: RigCalibration) -> None:
+        """Know what somebody else has put in force later, so that ``verify`` checks that."""
+        stamp_ns = stamp_from_msg(message.header.stamp)
+        if stamp_ns <= self._since_ns:
+            return
+        calibration = parse_calibration(message.yaml, f"calibration/rig ({message.source})")
+        self._in_force, self._source = calibration, message.source
+        self._since_ns = stamp_ns
+
+    def health(self) -> Health:
+        """What is in force, and what is being done."""
+        calibration = self._in_force
+        message = "ready" if calibration else f"ready; {self._fault}"
+        if self._running.locked():
+            message = "a run is going on"
+        values: dict[str, object] = {
+            "calibration": calibration.hash if calibration else "",
+            "source": self._source,
+            "last run": self._last,
+            "store": str(self._store.directory),
+        }
+        return Health("ok", message, "calibration", str(self._store.directory), values)
+
+    def close(self) -> None:
+        """End; a run that is going on is cancelled, since the context is gone."""
+        self._action.destroy()
+        super().close()
+
+    # -- calibrate --------------------------------------------------------------------------------
+
+    async def _serve(self, request: Any, response: Any) -> Any:
+        outcome = await self.in_worker(
+            lambda: self._calibrate(request, lambda _: None, self._shutting_down)
+        )
+        return fill(response, outcome)
+
+    async def _execute(self, goal: Any) -> Any:
+        def tell(progress: Progress) -> None:
+            goal.publish_feedback(_feedback(progress))
+
+        def cancelled() -> bool:
+            return bool(goal.is_cancel_requested) or self._shutting_down()
+
+        outcome = await self.in_worker(lambda: self._calibrate(goal.request, tell, cancelled))
+        if outcome.cancelled and goal.is_cancel_requested:
+            goal.canceled()
+        elif outcome.success:
+            goal.succeed()
+        else:
+            goal.abort()
+        return fill(CalibrateAction.Result(), outcome)
+
+    def _shutting_down(self) -> bool:
+        return not self.context.ok()
+
+    def _calibrate(
+        self, request: Any, tell: Callable[[Progress], None], cancelled: Callable[[], bool]
+    ) -> Outcome:
+        def work() -> Outcome:
+            order = self._order(request)
+            with self._gear.in_use(cancelled) as gear:
+                return self._calibrator.calibrate(gear, order, self._in_force, tell)
+
+        outcome = self._alone(work, Outcome)
+        if outcome.success and outcome.calibration is not None:
+            self._put_in_force(outcome.calibration, outcome.calibration_file, time.time_ns())
+        return outcome
+
+    def _alone(self, work: Callable[[], Any], failed: Callable[..., Any]) -> Any:
+        """Do one run at a time; what goes wrong is its answer."""
+        if not self._running.acquire(blocking=False):
+            return failed(message="a run is going on already; wait for it or cancel it")
+        try:
+            outcome = work()
+        except SlError as error:
+            outcome = failed(message=str(error))
+        except Exception as error:  # the caller gets an answer whatever happens
+            self.get_logger().error(f"calibration failed: {error!r}")
+            outcome = failed(message=f"internal fault: {error!r}")
+        finally:
+            self._running.release()
+        self._last = outcome.message
+        self.say(outcome.message)
+        return outcome
+
+    def _order(self, request: Any) -> Order:
+        heights = [float(h) for h in request.heights_m] or list(self._value("heights_m"))
+        plate = self._plate(request)
+        sequence = request.sequence or str(self._value("sequence"))
+        return Order(request.target or "both", tuple(heights), plate, sequence)
+
+    def _plate(self, request: Any = None) -> Plate:
+        """Plate of the parameters; what a request names is the request's."""
+
+        def number(name: str) -> Any:
+            asked = getattr(request, name, 0)
+            if not (math.isfinite(asked) and asked >= 0):
+                raise CalibrationError(f"{name}={asked}; expected a positive number or 0")
+            return asked or self._value(name)
+
+        return Plate(
+            columns=number("plate_columns"),
+            rows=number("plate_rows"),
+            pitch_m=number("plate_pitch_m"),
+            diameter_m=number("plate_diameter_m"),
+            dark_holes=bool(self._value("plate_dark_holes")),
+            origin_diameter_m=self._value("plate_origin_diameter_m") or None,
+            chamfer_m=self._value("plate_chamfer_m"),
+        )
+
+    # -- verify -----------------------------------------------------------------------------------
+
+    async def _serve_verify(self, request: Any, response: Any) -> Any:
+        def work() -> VerifyOutcome:
+            plate = self._plate()
+            sequence = str(self._value("sequence"))
+            if self._in_force is None:
+                raise CalibrationError(f"nothing to verify: {self._fault}")
+            with self._gear.in_use(self._shutting_down) as gear:
+                return self._calibrator.verify(
+                    gear, request.target or "plate", plate, sequence, self._in_force
+                )
+
+        outcome = await self.in_worker(lambda: self._alone(work, VerifyOutcome))
+        for name in ("success", "recalibrate", "message", "rms_m", "limit_m", "report"):
+            setattr(response, name, getattr(outcome, name))
+        return response
+
+
+#: Figures of an outcome that service and action answer with under the same names.
+_ANSWERS = (
+    "success", "accepted", "message", "camera_rms_px", "projector_rms_px", "camera_rms_m",
+    "projector_rms_m", "predicted_sigma_m", "left_out_rms_m", "views", "holes",
+    "calibration_file", "report", "hash",
+)  # fmt: skip
+
+
+def fill(response: Any, outcome: Outcome) -> Any:
+    """Put an outcome into a service's response or an action's result."""
+    for name in _ANSWERS:
+        setattr(response, name, getattr(outcome, name))
+    return response
+
+
+def _feedback(progress: Progress) -> Any:
+    return CalibrateAction.Feedback(
+        stage=progress.stage,
+        view=progress.view,
+        views=progress.views,
+        progress=float(progress.fraction),
+    )
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run the node."""
+    run(CalibrationNode, args)
+
+
+if __name__ == "__main__":
+    main()

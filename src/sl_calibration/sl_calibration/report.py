@@ -1,0 +1,353 @@
+"""The report of a calibration: one self-contained page for people, JSON for programs."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sl_calibration.report_pictures import off_plane, pictures, png
+from sl_calibration.solution import metres_per_pixel
+from sl_calibration.store import PAGE, REPORT
+from sl_calibration.verify import Check
+from sl_projector.documents import write_text
+from sl_reconstruct.calibration_file import Calibration
+from sl_reconstruct.rig import Device, Division
+
+if TYPE_CHECKING:
+    from sl_calibration.calibrator import Solved
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2em auto; max-width: 68em; color: #222;
+  background: #fff; padding: 0 1em }
+h1 { font-size: 1.5em } h2 { font-size: 1.15em; margin-top: 2em }
+.verdict { padding: .6em 1em; border-radius: .4em; font-weight: 600 }
+.good { background: #e2f3e2; color: #145214 } .bad { background: #fbe3e0; color: #7a1708 }
+table { border-collapse: collapse } td, th { padding: .25em 1.4em .25em 0; text-align: left;
+  vertical-align: top; border-bottom: 1px solid #eee } td { font-variant-numeric: tabular-nums }
+img { max-width: 100%; display: block; margin: 1em 0 } pre { margin: 0 }
+"""
+
+#: The paper's Table 1 as it can be read (its matrices are not orthonormal and T's units unclear).
+PAPER_TABLE_1: Mapping[str, tuple[str, str]] = {
+    "Effective focal length f, mm": ("95.665", "192.792"),
+    "Distortion factor kappa, px^-2": ("3.76e-8", "1.20e-8"),
+    "Image centre C, px": ("(28.93, 479.42)", "(831.0, 420.2)"),
+}
+
+#: What each limited figure is, and the factor and unit in which people read it.
+FIGURES: Mapping[str, tuple[str, float, str]] = {
+    "hole_rms_px": ("Residuals of the holes, rms", 1.0, "camera px"),
+    "target_rms_px": ("Residuals of the projected targets, rms", 1.0, "DMD px"),
+    "rejected_part": ("Points left out as wrong", 100.0, "%"),
+    "point_sigma_m": ("1-sigma of z from the calibration, worst in the volume", 1e6, "µm"),
+    "left_out_z_m": ("z at a height left out, rms, worst", 1e6, "µm"),
+    "stage_scale_error": ("Stage's z scale off by", 1e6, "ppm"),
+    "stage_lean_rad": ("Stage's z travel against the plate's normal", math.degrees(1.0), "°"),
+    "uncovered_part": ("Camera image far from any hole", 100.0, "%"),
+}
+
+
+def write_report(folder: Path, solved: Solved, calibration: Calibration) -> None:
+    """Write ``report.json`` and ``report.html`` into a run's folder."""
+    content = report_content(solved, calibration)
+    write_json(folder / REPORT, content)
+    write_text(folder / PAGE, _page(solved, content))
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON; numbers that are not finite become null."""
+    text = json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False)
+    write_text(path, text + "\n")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def report_content(solved: Solved, calibration: Calibration) -> dict[str, Any]:
+    """Everything that the report says, plain values."""
+    solution, verdict = solved.solution, solved.verdict
+    joint = solution.joint
+    return {
+        "format": 1,
+        "accepted": verdict.passed,
+        "reasons": list(verdict.reasons),
+        "figures": dict(verdict.figures),
+        "limits": dict(vars(solved.limits)),
+        "predicted_sigma_m": solved.predicted_sigma_m,
+        "edge_sigma_px": solved.edge_noise.camera_u_px,
+        "camera": device_content(solved, 0),
+        "projector": device_content(solved, 1),
+        "stage": {name: value.tolist() for name, value in vars(joint.stage).items()},
+        "chi2": joint.chi2,
+        "degrees_of_freedom": joint.dof,
+        "sigma_scales": joint.scales,
+        "heights": _heights(solved),
+        "hash": calibration.hash,
+        "solving_s": solved.seconds,
+        "made_from": dict(solved.observations.made_from),
+    }
+
+
+def device_content(solved: Solved, index: int) -> dict[str, Any]:
+    """One device with its sigmas, and the paper's own solution of it."""
+    name = ("camera", "projector")[index]
+    joint = solved.solution.joint
+    device: Device = joint.state.devices[index]
+    search = (solved.solution.camera, solved.solution.projector)[index].search
+    prefix = f"{name}."
+    sigmas = {k.removeprefix(prefix): v for k, v in joint.sigmas.items() if k.startswith(prefix)}
+    kappa = device.lens.kappa if isinstance(device.lens, Division) else math.nan
+    return {
+        "focal_length_px": device.focal_length_px[0],
+        "focal_length_m": device.focal_length_px[0] * device.pixel_pitch_m,
+        "pixel_pitch_m": device.pixel_pitch_m,
+        "kappa": kappa,
+        "image_centre_px": list(device.image_centre_px),
+        "rotation": device.rotation,
+        "translation_m": device.translation_m,
+        "sigma": sigmas,
+        "rms_px": joint.rms_px(index),
+        "rms_m": joint.rms_px(index) * metres_per_pixel(device),
+        "paper_search": {
+            "cost_before_px2": search.cost_before_px2,
+            "cost_after_px2": search.cost_after_px2,
+            "points": search.points,
+            "linear_steps": search.steps,
+            "image_centre_px": list(search.device.image_centre_px),
+            "focal_length_px": search.device.focal_length_px[0],
+            "kappa": search.device.lens.kappa if isinstance(search.device.lens, Division) else None,
+        },
+    }
+
+
+def _heights(solved: Solved) -> list[dict[str, Any]]:
+    """Residuals of each height, and its error when it is left out."""
+    joint = solved.solution.joint
+    left = {check.height_m: check for check in solved.solution.left_out}
+    rows = []
+    for view in solved.observations.views:
+        row: dict[str, Any] = {"height_m": view.height_m}
+        for index, what in enumerate(("hole", "target")):
+            data = joint.problem.holes if index == 0 else joint.problem.targets
+            used = joint.used[joint.problem.groups[index]]
+            here = data.stage_m[used, 2] == view.height_m
+            residuals = joint.residuals_of(index)[here]
+            row[f"{what}s"] = int(here.sum())
+            row[f"{what}_rms_px"] = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
+        check = left.get(view.height_m)
+        row["left_out_z_rms_m"] = check.z_rms_m if check else math.nan
+        rows.append(row)
+    return rows
+
+
+# -- the page ---------------------------------------------------------------------------------------
+
+
+def _page(solved: Solved, content: Mapping[str, Any]) -> str:
+    title = f"Calibration of {content['made_from'].get('date', 'unknown date')}"
+    parts = [f"<h1>{_text(title)}</h1>", _banner(content["accepted"], content["reasons"])]
+    parts += [
+        _table("Verdict", ("Figure", "Found", "Limit"), _figure_rows(content)),
+        _table("Table 1: calibrated parameters, ± 1 sigma",
+               ("Parameter", "Projection device", "Camera", "Paper: projection device, camera"),
+               table_1(content)),
+        _table("The paper's search of the image centre: cost J", *_search_rows(content)),
+        _table("Stage", ("Quantity", "Value"), _stage_rows(content["stage"])),
+        _table("Heights", *_height_rows(content["heights"])),
+    ]  # fmt: skip
+    parts += [_picture(caption, image) for caption, image in pictures(solved)]
+    parts.append(_table("Made from", ("", ""), _origin_rows(content)))
+    return _document(title, parts)
+
+
+def _document(title: str, parts: Sequence[str]) -> str:
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{_text(title)}'
+        f"</title><style>{_STYLE}</style></head><body>\n" + "\n".join(parts) + "\n</body></html>\n"
+    )
+
+
+def _banner(accepted: bool, reasons: Sequence[str]) -> str:
+    if accepted:
+        return '<p class="verdict good">Accepted: every figure is within its limit</p>'
+    return f'<p class="verdict bad">Not accepted: {_text("; ".join(reasons))}</p>'
+
+
+def _figure_rows(content: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    rows = []
+    for name, (label, factor, unit) in FIGURES.items():
+        if name in content["figures"]:
+            found, limit = (content[kind][name] * factor for kind in ("figures", "limits"))
+            rows.append((label, f"{found:.4g} {unit}", f"{limit:.4g} {unit}"))
+    sigma = content["predicted_sigma_m"] * 1e6
+    noise = content["edge_sigma_px"]
+    return [
+        *rows,
+        (f"1-sigma of z with the noise of one edge ({noise:.3f} px), worst", f"{sigma:.4g} µm", "-"),
+    ]
+
+
+def table_1(content: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Rows of the paper's Table 1 for this rig: parameter, projector, camera, the paper's."""
+    both = [content["projector"], content["camera"]]
+    cells: dict[str, list[str]] = {
+        "Rotation matrix R": [_rotation_cell(d) for d in both],
+        "Translation vector T, mm": [_translation_cell(d) for d in both],
+        "Effective focal length f, mm": [
+            _pm(d["focal_length_m"] * 1e3, d["sigma"]["focal_length_px"] * d["pixel_pitch_m"] * 1e3)
+            for d in both
+        ],
+        "Effective focal length f, px": [
+            _pm(d["focal_length_px"], d["sigma"]["focal_length_px"]) for d in both
+        ],
+        "Distortion factor kappa, px^-2": [_pm(d["kappa"], d["sigma"]["kappa"]) for d in both],
+        "Image centre C, px": [_centre_cell(d) for d in both],
+        "Residual on the part, µm rms": [f"{d['rms_m'] * 1e6:.4f}" for d in both],
+    }
+    paper = {**PAPER_TABLE_1, "Residual on the part, µm rms": ("15", "10")}
+    return [
+        (name, *values, ", ".join(paper[name]) if name in paper else "")
+        for name, values in cells.items()
+    ]
+
+
+def _pm(value: float, sigma: float) -> str:
+    """Value with as many digits as its sigma deserves."""
+    if not (math.isfinite(sigma) and sigma > 0):
+        return f"{value:.7g}"
+    exponent = math.floor(math.log10(sigma))
+    if abs(value) < 1e-3:
+        scale = math.floor(math.log10(abs(value))) if value else exponent
+        digits = max(0, scale - exponent + 1)
+        return f"({value / 10.0**scale:.{digits}f} ± {sigma / 10.0**scale:.{digits}f})e{scale}"
+    digits = max(0, 1 - exponent)
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
+
+
+def _rotation_cell(device: Mapping[str, Any]) -> str:
+    rows = ["  ".join(f"{v:+.6f}" for v in row) for row in np.asarray(device["rotation"])]
+    worst = max(v for k, v in device["sigma"].items() if k.startswith("rotation_rad"))
+    return "\n".join([*rows, f"± {worst * 1e6:.2g} µrad at most"])
+
+
+def _translation_cell(device: Mapping[str, Any]) -> str:
+    sigma = device["sigma"]
+    return "\n".join(
+        _pm(t * 1e3, sigma[f"translation_m.{i}"] * 1e3)
+        for i, t in enumerate(np.asarray(device["translation_m"]))
+    )
+
+
+def _centre_cell(device: Mapping[str, Any]) -> str:
+    centre, sigma = device["image_centre_px"], device["sigma"]
+    return ", ".join(_pm(c, sigma[f"image_centre_px.{i}"]) for i, c in enumerate(centre))
+
+
+def _search_rows(content: Mapping[str, Any]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    head = ("Device", "J, centre in the middle, px²", "J at the minimum, px²", "Points",
+            "Centre found, px", "f, px", "Linear steps")  # fmt: skip
+    rows = []
+    for name in ("camera", "projector"):
+        s = content[name]["paper_search"]
+        u, v = s["image_centre_px"]
+        rows.append(
+            (name, f"{s['cost_before_px2']:.4g}", f"{s['cost_after_px2']:.4g}", f"{s['points']:,}",
+             f"{u:.2f}, {v:.2f}", f"{s['focal_length_px']:.2f}", str(s["linear_steps"]))
+        )  # fmt: skip
+    return head, rows
+
+
+def _stage_rows(stage: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    rows = []
+    for axis, scale, sigma in zip("xyz", stage["scale"], stage["scale_sigma"], strict=True):
+        if math.isfinite(scale):
+            rows.append(
+                (f"{axis}: true travel per metre read", f"1 {(scale - 1) * 1e6:+.1f} ppm "
+                                                        f"± {sigma * 1e6:.1f} ppm")
+            )  # fmt: skip
+    leans = zip("xy", stage["z_lean_rad"], stage["z_lean_sigma_rad"], strict=True)
+    for axis, lean, sigma in leans:
+        if math.isfinite(lean):
+            text = f"{math.degrees(lean):+.5f}° ± {math.degrees(sigma):.5f}°"
+            rows.append((f"z travel leans from the plate's normal towards {axis}", text))
+    return rows
+
+
+def _height_rows(
+    heights: Sequence[Mapping[str, Any]],
+) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    head = ("Stage height, mm", "Holes", "rms, camera px", "Targets", "rms, DMD px",
+            "z when left out, µm rms")  # fmt: skip
+    rows: list[tuple[str, ...]] = [
+        (f"{h['height_m'] * 1e3:.4f}", str(h["holes"]), f"{h['hole_rms_px']:.4f}",
+         str(h["targets"]), f"{h['target_rms_px']:.4f}", f"{h['left_out_z_rms_m'] * 1e6:.4f}")
+        for h in heights
+    ]  # fmt: skip
+    return head, rows
+
+
+def _origin_rows(content: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    rows = [("calibration hash", str(content["hash"])),
+            ("solving", f"{content['solving_s']:.2f} s")]  # fmt: skip
+    return rows + [
+        (str(name), json.dumps(_plain(value), ensure_ascii=False))
+        for name, value in content["made_from"].items()
+    ]
+
+
+def _table(heading: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    top = "".join(f"<th>{_text(name)}</th>" for name in head)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{_cell(cell)}</td>" for cell in row) + "</tr>" for row in rows
+    )
+    return f"<h2>{_text(heading)}</h2><table><tr>{top}</tr>{body}</table>"
+
+
+def _cell(text: str) -> str:
+    return f"<pre>{_text(text)}</pre>" if "\n" in text else _text(text)
+
+
+def _picture(caption: str, image: bytes) -> str:
+    return (
+        f'<h2>{_text(caption)}</h2><img alt="{_text(caption)}" '
+        f'src="data:image/png;base64,{base64.b64encode(image).decode()}">'
+    )
+
+
+def _text(value: str) -> str:
+    return html.escape(value, quote=True)
+
+
+# -- a check of the calibration in force ------------------------------------------------------------
+
+
+def write_verify_report(
+    folder: Path, check: Check, limit_m: float, message: str, calibration_hash: str
+) -> None:
+    """Write the report of a check: JSON and a page."""
+    names = ("target", "plane_rms_m", "gap_rms_m", "lattice_rms_m", "scale_error", "points")
+    content = {name: getattr(check, name) for name in names}
+    content |= {"rms_m": check.rms_m, "limit_m": limit_m, "message": message,
+                "calibration_hash": calibration_hash}  # fmt: skip
+    write_json(folder / REPORT, content)
+    good = check.rms_m <= limit_m
+    title = f"Check of the calibration in force on the {check.target}"
+    banner = f'<p class="verdict {"good" if good else "bad"}">{_text(message)}</p>'
+    rows = [(name.replace("_", " "), f"{value}") for name, value in content.items()]
+    picture = _picture("Points off the best plane", png(off_plane(check.points_m, check.off_plane_m)))
+    parts = [f"<h1>{_text(title)}</h1>", banner, _table("Figures", ("", ""), rows), picture]
+    write_text(folder / PAGE, _document(title, parts))
