@@ -262,6 +262,9 @@ class ReconstructNode(RigNode):
 
     def _on_stack(self, message: PatternStack) -> None:
         watch = self._watch_of(message.scan_id)
+        if watch is None and not self._clouds.get_subscription_count():
+            self._last = f"scan {message.scan_id}: not asked for here, and nobody listens"
+            return
         came_ns = watch.last_image_ns if watch and watch.last_image_ns else time.time_ns()
         if watch:
             watch.arrived()
