@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sl_reconstruct.edges import PRESENT
 from sl_reconstruct.geometry import DIVISION, Geometry, Optics, brown_undistort
-from sl_reconstruct.points import GEOMETRY, Output, find_steps
+from sl_reconstruct.points import GEOMETRY, Output, Screen, find_steps
 from sl_reconstruct.rows import Lines
 
 #: Row boundaries further apart than this are not interpolated between.
@@ -32,13 +32,13 @@ class Crossed(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def map_rows(first: int, last: int, lines: Lines, limit: float, v_map: Any, bad: Any) -> None:
+def map_rows(first: int, last: int, lines: Lines, screen: Screen, v_map: Any, bad: Any) -> None:
     """Fill the DMD row at the pixels of camera columns first to last; NaN where unknown.
 
     lines: row boundaries along camera columns, shape (W, DMD rows).
     """
     for x in range(first, last):
-        find_steps(lines.u_px, x, limit, bad)
+        find_steps(lines.u_px, x, screen, bad)
         out, at = v_map[x], lines.u_px[x]
         out[:] = np.nan
         last_j, last_y = -1, 0.0

@@ -59,6 +59,7 @@ class Tuning(NamedTuple):
     ``direction``: +1 where k grows with u, -1 where it falls. ``reach_px``: beyond it an edge's
     blur does not matter. ``around_px``: a fine stripe's half width. ``scale``: camera pixels per DMD pixel. ``floor_dn``: keeps quotients
     finite. ``noise_dn2``, ``noise_dn``: variance = noise_dn2 + noise_dn * level.
+    ``jump_px``: a centre may lie so far from where the edges on a side lead.
     """
 
     direction: int
@@ -76,6 +77,7 @@ class Tuning(NamedTuple):
     min_light: float
     noise_dn2: float
     noise_dn: float
+    jump_px: float
 
 
 class SourceRow(NamedTuple):

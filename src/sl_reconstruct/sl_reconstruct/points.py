@@ -15,6 +15,8 @@ from sl_reconstruct.reasons import Reason
 STEP = int(Reason.STEP)
 GEOMETRY = int(Reason.GEOMETRY)
 
+#: A boundary may move from row to row by so many times the jump that makes a step.
+ROW_JUMP = 2.0
 #: Boundaries over which a neighbour may be looked for.
 NEIGHBOURS = 8
 
@@ -27,6 +29,18 @@ class Output(NamedTuple):
     reason: NDArray[np.uint8]
 
 
+class Screen(NamedTuple):
+    """When neighbours say that a depth step lies under an edge.
+
+    ``jump_px``: an edge may lie so far from where two neighbours lead, camera pixels.
+    ``near_px``: signed least distance to the next boundary, ``wide_px`` of those on both sides.
+    """
+
+    jump_px: float
+    near_px: float
+    wide_px: float
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _off(u: Any, before: Any, after: Any, limit: Any, bad: Any) -> None:
     """Mark where ``u`` is not where two neighbours lead; before, after: (near, far)."""
@@ -36,26 +50,62 @@ def _off(u: Any, before: Any, after: Any, limit: Any, bad: Any) -> None:
         bad[k] |= np.uint8(abs(d) > limit) | np.uint8(abs(e) > limit)
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _squeezed(u: Any, left: Any, right: Any, s: Screen, bad: Any) -> None:
+    """Mark where boundaries crowd: a wall that the camera does not see, blurred.
+
+    Mirrored images are compared with their signs exchanged.
+    """
+    sign = np.float32(1 if s.near_px > 0 else -1)
+    near, wide = np.float32(abs(s.near_px)), np.float32(abs(s.wide_px))
+    for k in range(u.size):
+        a, b = sign * (u[k] - left[k]), sign * (right[k] - u[k])
+        bad[k] |= np.uint8(a < near) | np.uint8(b < near) | np.uint8(a + b < wide)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _apart(u: Any, other: Any, limit: float, bad: Any) -> None:
+    """Mark where another row has the boundary elsewhere."""
+    far = np.float32(limit)
+    for k in range(u.size):
+        bad[k] |= np.uint8(abs(other[k] - u[k]) > far)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _borders(u: Any, next_row: Any, limit: float, bad: Any) -> None:
+    """Mark where the next row holds nothing nearby, or another surface.
+
+    Such a row runs along a wall or a shadow: which side of it a pixel sees is not certain.
+    """
+    far = np.float32(limit)
+    for k in range(1, u.size - 1):
+        a, b, c = next_row[k - 1], next_row[k], next_row[k + 1]
+        nothing = (a != a) & (b != b) & (c != c)
+        bad[k] |= np.uint8(nothing) | np.uint8(abs(b - u[k]) > far)
+
+
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _side(u: Any, k: int, step: int) -> tuple[float, bool]:
-    """Where the next two present boundaries on a side lead, and whether there are two."""
+def _side(u: Any, k: int, step: int) -> tuple[float, float, int]:
+    """Where the next two present boundaries on a side lead, distance per boundary, their number."""
     first = -1
+    pace = 0.0
     for i in range(1, NEIGHBOURS + 1):
         j = k + step * i
         if j < 0 or j >= u.size:
             break
         if u[j] == u[j]:
-            if first < 0:
-                first = j
-            else:
-                return u[first] + (u[first] - u[j]) / (first - j) * (k - first), True
-    return 0.0, False
+            if first >= 0:
+                return u[first] + (u[first] - u[j]) / (first - j) * (k - first), pace, 2
+            first = j
+            pace = (u[j] - u[k]) / (j - k)
+    return 0.0, pace, 1 if first >= 0 else 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lonely(u: Any, limit: float, bad: Any) -> None:
+def _lonely(u: Any, s: Screen, bad: Any) -> None:
     """Check boundaries without near neighbours against farther ones; alone, they are refused."""
     n = u.size
+    sign, near = 1.0 if s.near_px > 0 else -1.0, abs(s.near_px)
     for k in range(n):
         if bad[k] or not u[k] == u[k]:
             continue
@@ -63,27 +113,37 @@ def _lonely(u: Any, limit: float, bad: Any) -> None:
         right = k < n - 2 and u[k + 1] + u[k + 2] == u[k + 1] + u[k + 2]
         if left and right:
             continue
-        a, has_a = _side(u, k, -1)
-        b, has_b = _side(u, k, 1)
-        off = (has_a and abs(u[k] - a) > limit) or (has_b and abs(u[k] - b) > limit)
-        if off or not (has_a or has_b):
+        a, pace_a, has_a = _side(u, k, -1)
+        b, pace_b, has_b = _side(u, k, 1)
+        off = (has_a == 2 and abs(u[k] - a) > s.jump_px) or (
+            has_b == 2 and abs(u[k] - b) > s.jump_px
+        )
+        crowd = (has_a and sign * pace_a < near) or (has_b and sign * pace_b < near)
+        near_by = 0
+        for j in range(max(0, k - 2), min(n, k + 3)):
+            near_by += u[j] == u[j]
+        if off or crowd or has_a + has_b < 2 or near_by < 2:
             bad[k] = 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find_steps(u_px: Any, y: int, limit: float, bad: Any) -> None:
+def find_steps(u_px: Any, y: int, s: Screen, bad: Any) -> None:
     """Mark boundaries of row y that are not where their neighbours in row and column lead."""
     u = u_px[y]
     n, rows = u.size, u_px.shape[0]
-    limit32 = np.float32(limit)
-    for k in range(n):
-        bad[k] = 0
-    if n > 4:
-        mid = u[2 : n - 2]
-        _off(mid, (u[1 : n - 3], u[: n - 4]), (u[3 : n - 1], u[4:]), limit32, bad[2 : n - 2])
+    limit = np.float32(s.jump_px)
+    bad[:] = 0
+    _squeezed(u[1 : n - 1], u[: n - 2], u[2:], s, bad[1 : n - 1])
+    mid = u[2 : n - 2]
+    _off(mid, (u[1 : n - 3], u[: n - 4]), (u[3 : n - 1], u[4:]), limit, bad[2 : n - 2])
     if 2 <= y < rows - 2:
-        _off(u, (u_px[y - 1], u_px[y - 2]), (u_px[y + 1], u_px[y + 2]), limit32, bad)
-    _lonely(u, limit, bad)
+        _off(u, (u_px[y - 1], u_px[y - 2]), (u_px[y + 1], u_px[y + 2]), limit, bad)
+    for step in (-1, 1):
+        if 0 <= y + step < rows:
+            _borders(u, u_px[y + step], ROW_JUMP * s.jump_px, bad)
+        if 0 <= y + 2 * step < rows:
+            _apart(u, u_px[y + 2 * step], 2 * ROW_JUMP * s.jump_px, bad)
+    _lonely(u, s, bad)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -116,10 +176,10 @@ def _row(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def triangulate_rows(
-    first: int, last: int, g: Geometry, columns: Any, lines: Any, limit: float, out: Output,
+    first: int, last: int, g: Geometry, columns: Any, lines: Any, screen: Screen, out: Output,
     r: Rays, bad: Any,
 ) -> None:  # fmt: skip
     """Screen and triangulate rows first to last. columns: observed DMD column of each boundary."""
     for y in range(first, last):
-        find_steps(lines.u_px, y, limit, bad)
+        find_steps(lines.u_px, y, screen, bad)
         _row(g, y, columns, lines, bad, r, out)

@@ -18,7 +18,7 @@ from sl_reconstruct.edges import SQRT_2PI, Filter, Tuning
 from sl_reconstruct.filters import bar_slope, edge_filter, gaussian_taps, tap_variance
 from sl_reconstruct.geometry import geometry, ray_row
 from sl_reconstruct.plan import AxisPlan, DecodePlan
-from sl_reconstruct.points import Output, triangulate_rows
+from sl_reconstruct.points import Output, Screen, triangulate_rows
 from sl_reconstruct.quality import check_identity, check_order, check_phase
 from sl_reconstruct.rig import Rig
 from sl_reconstruct.rows import Layout, Lines, decode_rows, row_scratch
@@ -32,6 +32,8 @@ FIRST_BLUR_PX = 1.0
 REACH_SD = 2.5
 #: A jump counts from so many standard deviations on.
 JUMP_SD = 6.0
+#: Distance to both neighbours together, over twice the least distance to one.
+WIDE_SPACING = 1.35
 #: A usable BR8 needs this slope at a stripe's centre, per pixel of a unit stripe.
 MIN_BAR_SLOPE = 0.05
 
@@ -120,11 +122,11 @@ class Reconstructor:
         state, lines, figures = self._decode(stack, column, self.plan.white, self.plan.black)
         out = _output(*lines.u_px.shape)
         columns = np.arange(column.size_px) - 0.5
-        limit = _jump_limit(self.settings, figures)
+        screen = _screen(self.settings, figures)
 
         def work(first: int, last: int) -> None:
             scratch = ray_row(column.size_px), np.zeros(column.size_px, np.uint8)
-            triangulate_rows(first, last, self._geometry, columns, lines, limit, out, *scratch)
+            triangulate_rows(first, last, self._geometry, columns, lines, screen, out, *scratch)
 
         share_rows(work, stack.shape[1])
         crossed = self._cross(stack, lines, columns, out) if self.plan.row else None
@@ -143,10 +145,10 @@ class Reconstructor:
         sigma_v = float(np.nanmedian(across.sigma_px)) / t.scale
         v_map = np.empty((stack.shape[2], stack.shape[1]), np.float32)
         add = Crossed(v_map, *(np.empty_like(out.u_px) for _ in range(3)))
-        limit, gap_px = _jump_limit(self.settings, figures), self.settings.max_gap_px or np.inf
+        screen, gap_px = _screen(self.settings, figures), self.settings.max_gap_px or np.inf
 
         def work_rows(first: int, last: int) -> None:
-            map_rows(first, last, across, limit, v_map, np.zeros(plan.size_px, np.uint8))
+            map_rows(first, last, across, screen, v_map, np.zeros(plan.size_px, np.uint8))
 
         def work(first: int, last: int) -> None:
             cross_rows(first, last, self._geometry, columns, lines, sigma_v, gap_px, out, add)
@@ -189,10 +191,12 @@ class Reconstructor:
         return self._scratch[key]
 
 
-def _jump_limit(settings: Settings, figures: Figures) -> float:
-    """Jumps that noise makes are no depth steps: a second difference has sqrt(6) its sigma."""
-    noise = JUMP_SD * np.sqrt(6) * figures.edge_sigma_px
-    return max(settings.max_jump_px, float(noise)) if noise > 0 else settings.max_jump_px
+def _screen(settings: Settings, figures: Figures) -> Screen:
+    """Limits for neighbours; a second difference has sqrt(6) times the noise of its edges."""
+    noise_px = JUMP_SD * np.sqrt(6) * figures.edge_sigma_px
+    jump_px = max(settings.max_jump_px, noise_px) if noise_px > 0 else settings.max_jump_px
+    near_px = settings.min_spacing * figures.scale_px
+    return Screen(float(jump_px), near_px, 2 * WIDE_SPACING * near_px)
 
 
 def _output(height: int, boundaries: int) -> Output:
@@ -231,6 +235,7 @@ def make_layout(plan: AxisPlan, white: int, black: int) -> Layout:
     return Layout(
         np.array(sources, np.int64), edge_owner, centre_owner, np.array(bits, np.int64),
         np.array(plan.images, np.int64), white, black, plan.dynamic,
+        any(s.centres for s in plan.sources),
     )  # fmt: skip
 
 
@@ -241,6 +246,7 @@ def first_tuning(plan: AxisPlan, settings: Settings, full_scale: int) -> Tuning:
         1, int(np.ceil(REACH_SD * FIRST_BLUR_PX)), 4 * plan.division_px, 1.0, plan.division_px, plan.size_px,
         0.002 * full_scale, 0.5 * contrast_dn, contrast_dn,
         settings.saturation_dn or full_scale, 0.0, np.inf, settings.min_light, 0.0, 0.0,
+        settings.max_jump_px,
     )  # fmt: skip
 
 

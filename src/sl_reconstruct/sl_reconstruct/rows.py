@@ -46,6 +46,7 @@ from sl_reconstruct.pixels import (
 from sl_reconstruct.reasons import Reason
 
 ORDER = int(Reason.ORDER)
+STEP = int(Reason.STEP)
 MISSING = int(Reason.MISSING)
 
 
@@ -54,7 +55,8 @@ class Layout(NamedTuple):
 
     ``sources``: (n, 6) image, inverse, half period, rising, edges, centres. ``edge_owner``,
     ``centre_owner``: which source gives each boundary, -1 for none. ``bits``: (m, 3) image,
-    inverse, flipped. ``images``: all images of the axis.
+    inverse, flipped. ``images``: all images of the axis. ``dynamic``: some source
+    is a single image; ``centres``: some source gives centres.
     """
 
     sources: NDArray[np.int64]
@@ -65,6 +67,7 @@ class Layout(NamedTuple):
     white: int
     black: int
     dynamic: bool
+    centres: bool
 
 
 class Lines(NamedTuple):
@@ -229,6 +232,53 @@ def _source(
         _bars(s, plan, f, t, p, r, out, bar_slope)
 
 
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _lead(
+    u_px: Any, reason: Any, owner: Any, start: int, step: int, count: int
+) -> tuple[int, float, float]:
+    """Nearest edge from ``start`` on, its column, and the pace from it to the farthest one.
+
+    Looks at ``count`` boundaries; the pace is NaN where there are fewer than two edges.
+    """
+    near, pace = -1, np.nan
+    at = 0.0
+    for i in range(count):
+        k = start + step * i
+        if 0 <= k < owner.size and owner[k] >= 0 and reason[k] == PRESENT:
+            if near < 0:
+                near, at = k, np.float64(u_px[k])
+            else:
+                pace = (u_px[k] - at) / (k - near)
+    return near, at, pace
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _check_centres(plan: Layout, t: Tuning, out: Found) -> None:
+    """Refuse centres to which the edges on both sides do not lead.
+
+    A centre is taken from edges D away, so a depth step or a kink between them goes unseen.
+    """
+    edge_owner, centre_owner, u_px, reason = (
+        plan.edge_owner, plan.centre_owner, out.u_px, out.reason,
+    )  # fmt: skip
+    k, n = 0, reason.size
+    while k < n:
+        if centre_owner[k] < 0:
+            k += 1
+            continue
+        first, half = k, plan.sources[centre_owner[k], 2]
+        while k < n and centre_owner[k] >= 0:
+            k += 1
+        a, u_a, pace_a = _lead(u_px, reason, edge_owner, first - 1, -1, half)
+        b, u_b, pace_b = _lead(u_px, reason, edge_owner, k, 1, half)
+        for i in range(first, k):
+            left = abs(u_px[i] - u_a - pace_a * (i - a))
+            right = abs(u_px[i] - u_b - pace_b * (i - b))
+            if reason[i] == PRESENT and not (left <= t.jump_px and right <= t.jump_px):
+                reason[i] = STEP
+                u_px[i] = np.nan
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _levels(p: PixelRow, dynamic: bool, out: Found) -> None:
     """Bright level at every found boundary, DN."""
@@ -287,6 +337,8 @@ def _row(
     decode_pixels(stack, y, plan, t, p)
     for s in range(plan.sources.shape[0]):
         _source(stack, y, s, plan, f, t, p, r, found, lines.tally[i, s], bar_slope)
+    if plan.centres:
+        _check_centres(plan, t, found)
     _levels(p, plan.dynamic, found)
     _see(p, seen, blind)
     _account(plan, seen, blind, t.division_px, found.reason)

@@ -32,6 +32,9 @@ class Settings:
     max_jump_px : float
         An edge is refused when it lies further than this from where its neighbours on either
         side lead: at a depth step the blur mixes two surfaces. Camera pixels.
+    min_spacing : float
+        An edge is refused when the next boundary is nearer than this part of their usual
+        distance: behind a wall that the camera does not see, boundaries crowd.
     min_slope, max_slope : float
         Bounds of an edge's slope over the slope that the blur makes expect.
     min_light : float
@@ -51,6 +54,7 @@ class Settings:
     min_contrast_dn: float | None = None
     saturation_dn: int | None = None
     max_jump_px: float = 0.7
+    min_spacing: float = 0.3
     min_slope: float = 0.5
     max_slope: float = 1.7
     min_light: float = 0.25
@@ -70,8 +74,9 @@ class Settings:
                 f"min_slope={self.min_slope}, max_slope={self.max_slope}, "
                 f"max_jump_px={self.max_jump_px}; expected 0 <= min < max and a positive jump"
             )
-        if not 0 <= self.min_light < 1:
-            raise ConfigError(f"min_light={self.min_light}; expected 0 <= min_light < 1")
+        for name in ("min_light", "min_spacing"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"{name}={getattr(self, name)}; expected 0 <= {name} < 1")
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values by name, for files."""
