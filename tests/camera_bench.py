@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import importlib.util
+import itertools
 import shutil
 import subprocess
 import sys
@@ -20,7 +21,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sl_bench.camera_emulator import CameraEmulator, Exposure
+from sl_bench.camera_emulator import CameraEmulator, Execute, Exposure
+from sl_bench.gige_camera import GigeCamera
 from sl_bringup.bag_writer import new_bag
 from sl_camera.aravis_camera import AravisCamera, load_aravis
 from sl_camera.camera import CameraDriver
@@ -203,8 +205,45 @@ def aravis(tmp_path: Path) -> Iterator[Made]:
 
 
 @contextmanager
+def gige_bench(
+    bits: int = 8, first: int = 1, size: tuple[int, int] = (WIDTH, HEIGHT)
+) -> Iterator[tuple[CameraEmulator, GigeCamera]]:
+    """The bench's camera served by GigE Vision; pixel values are the frame's number."""
+    require_gi()
+    made: list[GigeCamera] = []
+
+    def endpoint(execute: Execute) -> GigeCamera:
+        made.append(GigeCamera(execute, size, bits))
+        return made[0]
+
+    def render(exposure: Exposure) -> np.ndarray:
+        dtype = np.uint8 if bits == 8 else np.uint16
+        image = np.full((size[1], size[0]), exposure.number % (1 << bits), dtype)
+        image[0] = np.arange(size[0])
+        return image
+
+    with gvcp_port():
+        emulator = CameraEmulator(
+            endpoint, render, size, max_rate_hz=1000.0, readout_s=0.0,
+            pixel_format="mono8" if bits == 8 else "mono16",
+        )  # fmt: skip
+        emulator._frame_ids = itertools.count(first)
+        emulator.start()
+        try:
+            yield emulator, made[0]
+        finally:
+            emulator.close()
+
+
+@contextmanager
+def gige(tmp_path: Path) -> Iterator[Made]:
+    with gige_bench():
+        yield Made(AravisCamera("BENCH"))
+
+
+@contextmanager
 def real(address: str) -> Iterator[Made]:
     yield Made(make_camera(address), regions=not address.startswith("bag:"))
 
 
-KINDS = {"socket": emulated, "bag": recorded, "uvc": webcam, "aravis": aravis}
+KINDS = {"socket": emulated, "bag": recorded, "uvc": webcam, "aravis": aravis, "gige": gige}

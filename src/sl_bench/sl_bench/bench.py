@@ -1,8 +1,9 @@
 """The process that stands in for the hardware: one world, three emulators, a control socket.
 
 ``python -m sl_bench.bench --config FILE --runtime-dir DIR`` says ``bench ready`` when all
-endpoints accept: ``usb.sock`` (the DLPC900), ``camera.sock``, ``stage`` (a serial port) and
-``control.sock`` in the runtime directory. It ends on SIGINT or SIGTERM and removes them.
+endpoints accept: ``usb.sock`` (the DLPC900), ``camera.sock`` (or GigE Vision, see
+`BenchSettings.camera_gige`), ``stage`` (a serial port) and ``control.sock`` in the runtime
+directory. It ends on SIGINT or SIGTERM and removes them.
 """
 
 from __future__ import annotations
@@ -24,10 +25,11 @@ from numpy.typing import NDArray
 
 from sl_bench.bench_control import ControlServer
 from sl_bench.bench_settings import BenchSettings, read_settings
-from sl_bench.camera_emulator import CameraEmulator, Exposure, Position
+from sl_bench.camera_emulator import CameraEmulator, Endpoint, Execute, Exposure, Position
 from sl_bench.camera_faults import CameraFaults
 from sl_bench.dlpc900_emulator import Dlpc900Emulator
 from sl_bench.dlpc900_faults import Dlpc900Faults
+from sl_bench.gige_camera import GigeCamera
 from sl_bench.grbl_emulator import GrblEmulator
 from sl_bench.surfaces import make_surface
 from sl_bench.true_rig import rig_document, write_rig
@@ -74,7 +76,7 @@ class Bench:
             seed=settings.seed,
         )
         self.camera = CameraEmulator(
-            self._dir / "camera.sock",
+            self._camera_endpoint(settings),
             self._render,
             rig.camera.image_size,
             stage_m=self.stage.position_m,
@@ -122,6 +124,19 @@ class Bench:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+    def _camera_endpoint(self, settings: BenchSettings) -> Path | Callable[[Execute], Endpoint]:
+        """Where the camera is served: a socket, or GigE Vision."""
+        self.gige: GigeCamera | None = None
+        if not settings.camera_gige:
+            return self._dir / "camera.sock"
+
+        def make(execute: Execute) -> Endpoint:
+            size, bits = self.world.rig.camera.image_size, self.world.optics.bits
+            self.gige = GigeCamera(execute, size, bits, settings.camera_gige)
+            return self.gige
+
+        return make
 
     def _render(self, exposure: Exposure) -> NDArray[Any]:
         # The lamp scales time, not mirrors, so that the world's cache of noise-free frames holds.
@@ -220,6 +235,7 @@ class Bench:
 
     def _clear_faults(self) -> None:
         self.camera.faults = CameraFaults()
+        self._fault_packets(0.0, True)
         self._fault_dmd({f.name: getattr(Dlpc900Faults(), f.name) for f in _dmd_faults()})
         self.stage.open_switches()
         self.stage.jam(False)
@@ -229,10 +245,18 @@ class Bench:
 
     def _fault_camera(self, faults: dict[str, Any]) -> None:
         seconds = faults.pop("disconnect_s", None)
+        self._fault_packets(faults.pop("lose_packets", 0.0), faults.pop("resend", True))
         if faults or seconds is None:
             self.camera.faults = CameraFaults(**faults)
         if seconds is not None:
             self.camera.disconnect(float(seconds))
+
+    def _fault_packets(self, lose: float, resend: bool) -> None:
+        """Lose this part of the packets of a GigE Vision camera."""
+        if self.gige is not None:
+            self.gige.stream.lose, self.gige.stream.resend = float(lose), bool(resend)
+        elif lose:
+            raise ConfigError("lose_packets; this camera sends none, expected camera_gige")
 
     def _fault_dmd(self, faults: dict[str, Any]) -> None:
         seconds, cycle = faults.pop("unplug_s", None), faults.pop("power_cycle", False)

@@ -38,6 +38,9 @@ class BenchSettings:
         TI's part number; its size must be that of the rig's projector.
     camera_frame_rate_hz, camera_readout_s : float
         Fastest frame rate; time from the end of an exposure to the frame's delivery.
+    camera_gige : str
+        Serve the camera as a GigE Vision device on this network address (127.0.0.1, the driver's
+        address is then ``aravis:BENCH``); empty: on a local socket.
     stage_travel_m : tuple of float
         Travel of x, y, z; zero is in the middle.
     stage_homed : bool
@@ -58,6 +61,7 @@ class BenchSettings:
     seed: int = 0
     dmd_model: str = DEFAULT_MODEL
     camera_frame_rate_hz: float = 30.0
+    camera_gige: str = ""
     camera_readout_s: float = 0.004
     stage_travel_m: Triple = (0.05, 0.05, 0.02)
     stage_homed: bool = True

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +60,27 @@ class Exposure:
 
 
 Render = Callable[[Exposure], NDArray[Any]]
+Execute = Callable[[dict[str, Any]], dict[str, Any] | None]
+
+
+class Endpoint(Protocol):
+    """What carries commands to the camera and frames from it."""
+
+    def start(self) -> None:
+        """Serve from here on."""
+        ...
+
+    def close(self) -> None:
+        """Serve no more."""
+        ...
+
+    def disconnect(self, seconds: float) -> None:
+        """Be gone for a while."""
+        ...
+
+    def send(self, header: wire.Header, pixels: NDArray[Any]) -> None:
+        """Deliver one frame."""
+        ...
 
 
 @dataclass
@@ -89,8 +110,9 @@ class CameraEmulator:
 
     Parameters
     ----------
-    path : path
-        Its socket.
+    endpoint : path or callable
+        Its socket; or ``endpoint(execute)`` makes what serves it otherwise (`CameraServer`,
+        `sl_bench.gige_camera.GigeCamera`).
     render : callable
         ``render(exposure) -> image`` of the whole sensor, called from one thread.
     image_size : tuple of int
@@ -109,7 +131,7 @@ class CameraEmulator:
 
     def __init__(
         self,
-        path: str | Path,
+        endpoint: str | Path | Callable[[Execute], Endpoint],
         render: Render,
         image_size: tuple[int, int],
         stage_m: Callable[[], Position] = lambda: (0.0, 0.0, 0.0),
@@ -139,7 +161,9 @@ class CameraEmulator:
         self._rendering: queue.SimpleQueue[_Job] = queue.SimpleQueue()
         self._outbox = _Outbox()
         self._stop = threading.Event()
-        self._server = CameraServer(path, self._execute)
+        self._server: Endpoint = (
+            endpoint(self._execute) if callable(endpoint) else CameraServer(endpoint, self._execute)
+        )
         self._threads = [
             threading.Thread(target=target, name=f"camera {name}", daemon=True)
             for name, target in (
@@ -156,7 +180,7 @@ class CameraEmulator:
             thread.start()
 
     def close(self) -> None:
-        """Switch off; the socket is gone afterwards."""
+        """Switch off; its endpoint is gone afterwards."""
         self._stop.set()
         self._server.close()
         for thread in self._threads:

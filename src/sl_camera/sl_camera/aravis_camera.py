@@ -142,6 +142,8 @@ class AravisCamera:
         self._latch_due = 0.0
         self._ids = FrameIds(GVSP_PERIOD)
         self._chunks: Any = None
+        self._chunk_names: list[str] = []
+        self._tick_ns = 1.0
         self._counts = CameraStatistics()
 
     @property
@@ -420,11 +422,15 @@ class AravisCamera:
 
     def _set_chunks(self, camera: Any) -> None:
         """Ask for frame number, time stamp and exposure in each frame, where the camera can."""
-        self._chunks = None
+        self._chunk_names = []
+        self._tick_ns = _tick_ns(camera)
         if not camera.are_chunks_available():
             return
         there = camera.dup_available_enumerations_as_strings("ChunkSelector")
-        camera.set_chunks(",".join(name for name in CHUNKS if name in there))
+        names = [name for name in CHUNKS if name in there]
+        features = camera.get_device().get_feature
+        self._chunk_names = [name for name in names if features(f"Chunk{name}") is not None]
+        camera.set_chunks(",".join(self._chunk_names))
         self._chunks = camera.create_chunk_parser()
 
     def _set_packets(self, camera: Any) -> None:
@@ -442,8 +448,10 @@ class AravisCamera:
         self._latch_due = time.monotonic() + LATCH_EVERY_S
         for command, value in LATCHES:
             if camera.is_feature_available(command) and camera.is_feature_available(value):
-                scale = _tick_ns(camera)
-                samples = [_read_clock(camera, command, value, scale) for _ in range(LATCH_SAMPLES)]
+                tick_ns = self._tick_ns
+                samples = [
+                    _read_clock(camera, command, value, tick_ns) for _ in range(LATCH_SAMPLES)
+                ]
                 self._clock.latch(samples)
                 return
 
@@ -471,29 +479,34 @@ class AravisCamera:
         complete = complete and len(data) >= size
         if len(data) < size:
             data = data.ljust(size, b"\0")
-        frame_id, exposure_s = self._chunk_values(buffer, complete)
-        device_ns = buffer.get_timestamp()
+        chunks = self._chunk_values(buffer) if complete else {}
+        exposure_s = chunks.get("ExposureTime", self._exposure_s * 1e6) * 1e-6
+        ticks = chunks.get("Timestamp")
+        device_ns = buffer.get_timestamp() if ticks is None else round(ticks * self._tick_ns)
         self._clock.arrival(device_ns, buffer.get_system_timestamp(), exposure_s)
-        self._ids.take(frame_id)
+        # The stream numbers all frames, the broken ones too; chunks come with whole ones only.
+        self._ids.take(buffer.get_frame_id())
         self._counts.received += 1
         self._counts.incomplete += not complete
         return Frame(
             unpack(data, format_, width, height),
-            frame_id,
+            int(chunks.get("FrameID", buffer.get_frame_id())),
             self._clock.host_ns(device_ns),
             exposure_s,
             FrameStatus.OK if complete else FrameStatus.INCOMPLETE,
             format_.bits,
         )
 
-    def _chunk_values(self, buffer: Any, complete: bool) -> tuple[int, float]:
-        """Frame number and exposure: the camera's own in this frame, else the stream's."""
-        frame_id, exposure_s = int(buffer.get_frame_id()), self._exposure_s
-        if not (complete and self._chunks is not None and buffer.has_chunks()):
-            return frame_id, exposure_s
-        with contextlib.suppress(Exception):  # a camera without that chunk
-            exposure_s = self._chunks.get_float_value(buffer, "ChunkExposureTime") * 1e-6
-        return frame_id, exposure_s
+    def _chunk_values(self, buffer: Any) -> dict[str, float]:
+        """What the camera sent with the frame, in its units; chunks that it lacks are not there."""
+        if not (self._chunk_names and buffer.has_chunks()):
+            return {}
+        read = {
+            "FrameID": self._chunks.get_integer_value,
+            "Timestamp": self._chunks.get_integer_value,
+            "ExposureTime": self._chunks.get_float_value,
+        }
+        return {name: read[name](buffer, f"Chunk{name}") for name in self._chunk_names}
 
 
 def _pair(found: Any) -> tuple[int, int]:
