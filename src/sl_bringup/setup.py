@@ -31,6 +31,7 @@ setup(
     entry_points={
         "console_scripts": [
             "ready_node = sl_bringup.ready_node:main",
+            "calibrate_node = sl_bringup.calibrate_node:main",
             "scan_node = sl_bringup.scan_node:main",
         ]
     },

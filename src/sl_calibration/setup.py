@@ -24,4 +24,9 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},
     zip_safe=False,
+    entry_points={
+        "console_scripts": [
+            "calibration_node = sl_calibration.calibration_node:main",
+        ]
+    },
 )
