@@ -55,6 +55,7 @@ class CalibrationNode(RigNode):
         self._gear.timeouts = self._timeouts
         self._gear.max_repeats = self._repeats
         self._gear.move_timeout_s = self._move_timeout_s
+        self._gear.settle_s = self._settle_s
         self._running = threading.Lock()
         self._in_force: Calibration | None = None
         self._source = ""
@@ -103,7 +104,7 @@ class CalibrationNode(RigNode):
         self._stage_tolerance_m = self.declare(
             "stage_tolerance_m", 5e-6, "the stage stands where it was sent within, m", 1e-7, 1e-3
         )
-        self._repeats = self.declare("max_repeats", 2, "how often a spoilt stack is repeated", 0, 9)
+        self._repeats = self.declare("max_repeats", 4, "how often a spoilt stack is repeated", 0, 9)
         self._verify_limit_m = self.declare(
             "verify_limit_m", 3e-6, "error beyond which verify says to recalibrate, m", 1e-8, 1e-2
         )
@@ -151,6 +152,9 @@ class CalibrationNode(RigNode):
         )
         self._move_timeout_s = self.declare(
             "move_timeout_s", 120.0, "wait for the stage, s", 1.0, 3600.0
+        )
+        self._settle_s = self.declare(
+            "settle_s", 0.2, "rest after a move before anything is exposed, s", 0.0, 60.0
         )
 
     def _value(self, name: str) -> Any:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from geometry_msgs.msg import Point
+from geometry_msgs.msg import Point, PoseStamped
 from sl_interfaces.msg import MatchedFrame, PatternStack
 from sl_interfaces.srv import MoveStage, Project
 from std_srvs.srv import Trigger
@@ -19,12 +19,15 @@ from std_srvs.srv import Trigger
 from sl_calibration.session import RunCancelled, Taken
 from sl_projector.base_node import EVENTS, LARGE, RigNode, next_scan_id
 from sl_projector.errors import CalibrationError, DeviceError, DeviceTimeout, SlError
+from sl_projector.messages import stamp_from_msg
 from sl_reconstruct.messages import stack_from_msg
 from sl_reconstruct.scan_flow import ScanFailed, ScanOrder, ScanRun, ScanTimeouts, ScanWatch
 
 #: A stage that is there answers a question about its travel within this.
 _ANSWER_S = 5.0
 _POLL_S = 0.02
+#: Pause before a spoilt stack is repeated, longer each time: what spoilt it is to be over.
+REST_S = 2.0
 #: Publishers and services of a graph that has just started are found within this.
 _DISCOVERY_S = 10.0
 
@@ -50,7 +53,9 @@ class RigGear:
         self._watch: ScanWatch | None = None
         self._last_id = 0
         self._cancelled: Callable[[], bool] = lambda: False
+        self._pose_ns = 0
         self.move_timeout_s = 120.0
+        self.settle_s = 0.2
         self.max_repeats = 2
         self.timeouts = ScanTimeouts()
 
@@ -61,6 +66,7 @@ class RigGear:
         subscriptions = [
             self._node.subscribe(MatchedFrame, "synchronizer/frame", self._on_frame, EVENTS),
             self._node.subscribe(PatternStack, "synchronizer/stack", self._on_stack, LARGE),
+            self._node.subscribe(PoseStamped, "stage/pose", self._on_pose, EVENTS),
         ]
         try:
             self._await_publishers(subscriptions)
@@ -73,8 +79,9 @@ class RigGear:
         end_s = time.monotonic() + _DISCOVERY_S
         while not all(s.get_publisher_count() for s in subscriptions):
             if time.monotonic() > end_s:
+                missing = [s.topic_name for s in subscriptions if not s.get_publisher_count()]
                 raise CalibrationError(
-                    "nobody publishes synchronizer/stack: is the synchronizer node running?"
+                    f"nobody publishes {' and '.join(missing)}: are synchronizer and stage running?"
                 )
             self._pause()
 
@@ -114,8 +121,22 @@ class RigGear:
             ) from error
 
     def move(self, height_m: float) -> float:
-        """Move in z only; the other axes stay."""
-        return self._height(self._ask(height_m))
+        """Move in z only, and wait until the stage has told anew that it stands.
+
+        Exposures are matched with the poses told before and after them; one from before the
+        move would make the synchroniser believe that the stage moved meanwhile.
+        """
+        reply = self._ask(height_m)
+        settled_ns = stamp_from_msg(reply.pose.header.stamp) + round(self.settle_s * 1e9)
+        end_s = time.monotonic() + self.settle_s + _ANSWER_S
+        while self._pose_ns < settled_ns:
+            if time.monotonic() > end_s:
+                raise DeviceTimeout("stage/pose is silent: is the stage node running?")
+            self._pause()
+        return self._height(reply)
+
+    def _on_pose(self, message: Any) -> None:
+        self._pose_ns = stamp_from_msg(message.header.stamp)
 
     def _ask(self, z_m: float, relative: bool = False, check_only: bool = False) -> Any:
         """Ask the stage node; what it refuses is raised with its reason."""
@@ -153,7 +174,7 @@ class RigGear:
 
     def take(self, sequence: str) -> Taken:
         """Project a sequence; spoilt attempts are repeated."""
-        order = ScanOrder(sequence, 0.0, self.max_repeats)
+        order = ScanOrder(sequence, 0.0, self.max_repeats, REST_S)
         result = ScanRun(self, order, lambda _: None, self._cancelled, self.timeouts).run()
         self._watch = None
         if result.cancelled:
@@ -192,9 +213,15 @@ class RigGear:
         self._watch = ScanWatch(self._last_id)
         return self._watch
 
-    def missing(self) -> str:
-        """Name what a scan cannot do without and nobody offers."""
-        if not self._project.wait_for_service(timeout_sec=3.0):
+    def missing(self, patience_s: float) -> str:
+        """Name what a scan cannot do without and nobody offers, even after a while."""
+        end_s = time.monotonic() + patience_s
+        while (gap := self._gap()) and time.monotonic() < end_s and not self._cancelled():
+            time.sleep(_POLL_S)
+        return gap
+
+    def _gap(self) -> str:
+        if not self._project.service_is_ready():
             return "nobody offers projector/project: is the projector node running?"
         if not self._node.count_publishers("camera/image_raw"):
             return "nobody publishes camera/image_raw: is the camera node running?"

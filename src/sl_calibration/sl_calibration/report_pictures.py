@@ -108,8 +108,11 @@ def residual_vectors(solved: Solved) -> Figure:
             u, v, du * arrow, dv * arrow, group.height_m[few] * _MM, angles="xy",
             scale_units="xy", scale=1, width=0.0018, cmap="viridis",
         )  # fmt: skip
-        axes.set(title=f"{group.name}: rms {rms:.4f} {group.unit}, arrows x {arrow:,.0f}")
         _image_axes(axes, group.size)
+        axes.set(
+            title=f"{group.name}: rms {rms:.4f} {group.unit}",
+            xlabel=f"u, px (arrows enlarged {arrow:,.0f} times)",
+        )
         figure.colorbar(arrows, ax=axes, label="stage height, mm", shrink=0.8)
     return figure
 

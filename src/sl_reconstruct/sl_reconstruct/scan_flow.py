@@ -42,11 +42,14 @@ class ScanOrder:
         Exposure of each pattern, seconds; 0: the projector's default.
     max_repeats : int
         How often a spoilt attempt is repeated.
+    rest_s : float
+        Pause before a repeat, longer each time, so that late images of the attempt before pass.
     """
 
     sequence: str = ""
     exposure_s: float = 0.0
     max_repeats: int = 2
+    rest_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -244,6 +247,14 @@ class ScanRun:
                     made = "once" if self._attempt == 1 else f"{self._attempt} times"
                     raise ScanFailed(f"the scan was tried {made}, at last: {error}") from error
                 self._result.attempt_messages.append(str(error))
+                self._rest(self._attempt * self._order.rest_s)
+
+    def _rest(self, seconds: float) -> None:
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            if self._cancelled():
+                raise ScanCancelled("scan cancelled")
+            time.sleep(POLL_S)
 
     def _once(self) -> Any:
         """One attempt: the node's report, or the reason why there is none."""
