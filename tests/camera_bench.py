@@ -201,7 +201,7 @@ def fake_gige(*options: str) -> Iterator[Callable[[], None]]:
 @contextmanager
 def aravis(tmp_path: Path) -> Iterator[Made]:
     with fake_gige():
-        yield Made(AravisCamera(SERIAL), (0, 0, 320, 240))
+        yield Made(AravisCamera("127.0.0.1"), (0, 0, 320, 240))
 
 
 @contextmanager
@@ -238,7 +238,7 @@ def gige_bench(
 @contextmanager
 def gige(tmp_path: Path) -> Iterator[Made]:
     with gige_bench():
-        yield Made(AravisCamera("BENCH"))
+        yield Made(AravisCamera("127.0.0.1"))
 
 
 @contextmanager

@@ -82,7 +82,7 @@ def test_old_feature_names_and_sixteen_bits() -> None:
 def test_frames_that_lack_packets_are_incomplete() -> None:
     """One packet in fifty lost, and the fake camera cannot send again."""
     with fake_gige("-r", "20"):
-        camera = AravisCamera(SERIAL)
+        camera = AravisCamera("127.0.0.1")
         camera.open()
         camera.configure(CameraSettings(EXPOSURE_S, trigger="software", region=(0, 0, 512, 512)))
         camera.arm()
@@ -96,7 +96,7 @@ def test_frames_that_lack_packets_are_incomplete() -> None:
 
 def test_a_camera_that_another_program_controls_is_told() -> None:
     with fake_gige():
-        first, second = AravisCamera(SERIAL), AravisCamera(SERIAL)
+        first, second = AravisCamera("127.0.0.1"), AravisCamera("127.0.0.1")
         first.open()
         first.configure(SMALL)
         with pytest.raises(DeviceError):
@@ -123,7 +123,7 @@ class Wired:
 
     def __init__(self, emulator: CameraEmulator, gige: GigeCamera) -> None:
         self.emulator, self.gige = emulator, gige
-        self.camera = AravisCamera("BENCH")
+        self.camera = AravisCamera("127.0.0.1")
 
     def ready(self, **changes: object) -> None:
         fields = {"exposure_s": EXPOSURE_S, **changes}
@@ -201,7 +201,7 @@ def test_the_camera_numbers_wrap_and_chunks_count_on() -> None:
 def test_lost_packets_are_sent_again() -> None:
     with gige_bench(size=(512, 384)) as ends:
         wired = Wired(*ends)
-        wired.camera = AravisCamera("BENCH", AravisOptions(packet_size=1500))
+        wired.camera = AravisCamera("127.0.0.1", AravisOptions(packet_size=1500))
         wired.ready()
         wired.gige.stream.lose = 0.02  # of 137 packets a frame
         wired.edges(20, period_s=0.02)

@@ -107,6 +107,19 @@ def test_a_latched_clock_is_right_to_half_its_reading() -> None:
     assert abs(clock.host_ns(start - offset) - start) <= 10_000
 
 
+def test_a_worse_reading_waits_until_the_clocks_may_have_drifted_as_far() -> None:
+    """A reading of +-10 us, then ones of +-5 ms: at 100 ppm they are no worse after 50 s."""
+    clock = DeviceClock()
+    start, second = 10**18, 10**9
+    clock.latch([(start, start + 10_000, start + 20_000)])
+    later = start + 10 * second
+    clock.latch([(later, later + 9_000_000, later + 10_000_000)])
+    assert clock.host_ns(start) == start
+    later = start + 60 * second
+    clock.latch([(later, later + 9_000_000, later + 10_000_000)])
+    assert clock.host_ns(start) == start - 4_000_000
+
+
 def test_without_a_latch_the_least_delayed_arrival_counts() -> None:
     clock = DeviceClock()
     for delay_ms in (9, 6, 12):

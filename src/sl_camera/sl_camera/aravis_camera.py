@@ -7,6 +7,7 @@ older cameras' names (ExposureTimeAbs, GainRaw) are known where Aravis knows the
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import math
 import time
 from collections.abc import Iterator
@@ -28,7 +29,7 @@ INSTALL = (
 RETRY_S = 0.5
 #: The device's clock is read again so often: at 50 ppm it drifts 0.1 ms meanwhile.
 LATCH_EVERY_S = 2.0
-LATCH_SAMPLES = 5
+LATCH_SAMPLES = 8
 #: Commands that freeze the device's clock, and where it then stands: SFNC and older GigE Vision.
 LATCHES = (
     ("TimestampLatch", "TimestampLatchValue"),
@@ -96,11 +97,15 @@ def list_cameras() -> list[str]:
 def find_camera(aravis: Any, wanted: str) -> str:
     """Return the id of the camera with this id, serial number or address; "" is the first.
 
+    An address is returned as it is: asking there directly spares a second of discovery.
+
     Raises
     ------
     DeviceLost
         When it does not answer.
     """
+    if _is_address(wanted):
+        return wanted
     aravis.update_device_list()
     found = []
     for i in range(aravis.get_n_devices()):
@@ -214,10 +219,13 @@ class AravisCamera:
             time.sleep(max(timeout_s, 0.0))
             return None
         buffer = self._stream.timeout_pop_buffer(max(0, round(timeout_s * 1e6)))
+        if buffer is not None:
+            return self._take(buffer)
         if self._armed and time.monotonic() >= self._latch_due:
+            # Between scans only: a new reading may shift the stamps a little.
             with self._errors("read its clock"):
                 self._latch(self._camera)
-        return None if buffer is None else self._take(buffer)
+        return None
 
     def software_trigger(self) -> None:
         """Expose one frame now; from any thread."""
@@ -507,6 +515,14 @@ class AravisCamera:
             "ExposureTime": self._chunks.get_float_value,
         }
         return {name: read[name](buffer, f"Chunk{name}") for name in self._chunk_names}
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.IPv4Address(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _pair(found: Any) -> tuple[int, int]:

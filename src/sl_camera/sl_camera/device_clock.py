@@ -6,6 +6,8 @@ from collections import deque
 
 #: Samples that decide; older ones are forgotten, so that drift is followed.
 WINDOW = 32
+#: Clocks drift apart by so much at most; what was read becomes uncertain at this rate.
+DRIFT = 100e-6
 
 
 class DeviceClock:
@@ -18,6 +20,8 @@ class DeviceClock:
 
     def __init__(self) -> None:
         self._latched_ns: int | None = None
+        self._latched_at_ns = 0
+        self._uncertainty_ns = 0
         self._delays_ns: deque[int] = deque(maxlen=WINDOW)
 
     @property
@@ -26,7 +30,7 @@ class DeviceClock:
         return self._latched_ns is not None
 
     def latch(self, samples: list[tuple[int, int, int]]) -> None:
-        """Take readings of the device's clock.
+        """Take readings of the device's clock, unless an older one is still more certain.
 
         Parameters
         ----------
@@ -34,7 +38,11 @@ class DeviceClock:
             Host clock before the reading, device clock, host clock after; the tightest counts.
         """
         before_ns, device_ns, after_ns = min(samples, key=lambda s: s[2] - s[0])
-        self._latched_ns = (before_ns + after_ns) // 2 - device_ns
+        uncertainty_ns = (after_ns - before_ns) // 2
+        aged_ns = self._uncertainty_ns + round(DRIFT * (before_ns - self._latched_at_ns))
+        if self._latched_ns is None or uncertainty_ns <= aged_ns:
+            self._latched_ns = (before_ns + after_ns) // 2 - device_ns
+            self._latched_at_ns, self._uncertainty_ns = after_ns, uncertainty_ns
 
     def arrival(self, device_ns: int, host_ns: int, exposure_s: float) -> None:
         """Take a frame: it arrived at `host_ns`, at least its exposure after its stamp."""
