@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import ast
 import re
+import runpy
 import statistics
 import tomllib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import setuptools
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHON_PACKAGES = (
@@ -161,11 +164,16 @@ def test_the_manifest_names_what_is_imported(package: str) -> None:
 
 
 @pytest.mark.parametrize("package", PYTHON_PACKAGES)
-def test_every_node_can_be_run_by_ros2_run(package: str) -> None:
-    setup = (ROOT / "src" / package / "setup.py").read_text()
-    for file in (ROOT / "src" / package / package).glob("*_node.py"):
+def test_ros2_run_finds_every_node(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[str, Any] = {}
+    monkeypatch.chdir(ROOT / "src" / package)
+    monkeypatch.setattr(setuptools, "setup", given.update)
+    runpy.run_path("setup.py")
+    assert given["name"] == package
+    for file in Path(package).glob("*_node.py"):
         if any(f.name == "main" for f in tree(file).body if isinstance(f, ast.FunctionDef)):
-            assert f"{package}.{file.stem}:main" in setup
+            script = f"{file.stem} = {package}.{file.stem}:main"
+            assert script in given["entry_points"]["console_scripts"]
 
 
 def interface_files() -> list[Path]:

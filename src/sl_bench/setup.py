@@ -8,6 +8,7 @@ from setuptools import find_packages, setup
 MANIFEST = ElementTree.parse("package.xml").getroot()
 NAME = MANIFEST.findtext("name")
 MAINTAINER = MANIFEST.find("maintainer")
+NODES = ["bench"]
 
 setup(
     name=NAME,
@@ -24,9 +25,5 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},
     zip_safe=False,
-    entry_points={
-        "console_scripts": [
-            "bench = sl_bench.bench:main",
-        ]
-    },
+    entry_points={"console_scripts": [f"{n} = {NAME}.{n}:main" for n in NODES]},
 )

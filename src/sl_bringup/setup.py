@@ -9,6 +9,7 @@ from setuptools import find_packages, setup
 MANIFEST = ElementTree.parse("package.xml").getroot()
 NAME = MANIFEST.findtext("name")
 MAINTAINER = MANIFEST.find("maintainer")
+NODES = [f.stem for f in Path(NAME).glob("*_node.py") if "\ndef main(" in f.read_text()]
 
 setup(
     name=NAME,
@@ -28,11 +29,5 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},
     zip_safe=False,
-    entry_points={
-        "console_scripts": [
-            "ready_node = sl_bringup.ready_node:main",
-            "calibrate_node = sl_bringup.calibrate_node:main",
-            "scan_node = sl_bringup.scan_node:main",
-        ]
-    },
+    entry_points={"console_scripts": [f"{n} = {NAME}.{n}:main" for n in NODES]},
 )

@@ -1,6 +1,7 @@
 """For colcon (ament_python); a plain venv is served by the pyproject.toml at the top."""
 
 import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
@@ -8,6 +9,7 @@ from setuptools import find_packages, setup
 MANIFEST = ElementTree.parse("package.xml").getroot()
 NAME = MANIFEST.findtext("name")
 MAINTAINER = MANIFEST.find("maintainer")
+NODES = [f.stem for f in Path(NAME).glob("*_node.py") if "\ndef main(" in f.read_text()]
 
 setup(
     name=NAME,
@@ -24,9 +26,5 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},
     zip_safe=False,
-    entry_points={
-        "console_scripts": [
-            "reconstruct_node = sl_reconstruct.reconstruct_node:main",
-        ]
-    },
+    entry_points={"console_scripts": [f"{n} = {NAME}.{n}:main" for n in NODES]},
 )
