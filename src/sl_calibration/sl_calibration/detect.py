@@ -27,6 +27,9 @@ MIN_HOLES = 12
 MIN_SHARE = 0.15
 #: Range of grey levels below which there is no light, DN (or the same share of 255).
 MIN_RANGE = 10.0 / 255.0
+#: A chamfer narrower than this is taken as part of the blur: it moves all centres alike, by a tenth
+#: of a pixel at most, which no calibration can tell from a moved plate.
+MIN_CHAMFER_PX = 1.5
 #: Sigma of a centre before its noise is looked at.
 ROUGH_SIGMA_PX = 0.02
 #: Added in quadrature to sigma: what the model of a blurred step leaves on clean images.
@@ -144,9 +147,11 @@ def _measured(
     grey: Image, plate: Plate, ids: Ids, start: Blobs, full: float
 ) -> tuple[Ids, HoleFits]:
     """Fit the edges of the holes that were found, then of those that should be there too."""
+    xy = plate.xy_m(ids)
+    if plate.chamfer_m:
+        start = Blobs(start.centres_px, _nominal_shapes(plate, ids, start))
     fits = _fitted(grey, plate, ids, start, full)
     use = np.isfinite(fits.centres_px[:, 0])
-    xy = plate.xy_m(ids)
     _check_enough(plate, int(use.sum()), len(ids))
     sigma = np.full(len(ids), ROUGH_SIGMA_PX)
     rough, _ = fit_map(plate, xy, fits.centres_px, sigma, use & ~_poor(fits))
@@ -166,7 +171,17 @@ def _measured(
 def _fitted(grey: Image, plate: Plate, ids: Ids, start: Blobs, full: float) -> HoleFits:
     step = start.sizes_px * plate.pitch_m / plate.radius_m(ids)
     gap = step * (1 - (plate.diameter_m + 2 * plate.chamfer_m) / plate.pitch_m)
-    return fit_holes(grey, start.centres_px, start.shapes_px2, gap, full)
+    resolved = start.sizes_px * plate.chamfer_m / plate.radius_m(ids) > MIN_CHAMFER_PX
+    rim = 1 + np.where(resolved, plate.chamfer_m / plate.radius_m(ids), 0.0)
+    return fit_holes(grey, start.centres_px, start.shapes_px2, gap, full, rim)
+
+
+def _nominal_shapes(plate: Plate, ids: Ids, start: Blobs) -> Array:
+    """Ellipses of the holes' bottoms: a spot may be as large as its chamfer's upper rim."""
+    everywhere = np.ones(len(ids), dtype=bool)
+    sigma = np.full(len(ids), ROUGH_SIGMA_PX)
+    rough, _ = fit_map(plate, plate.xy_m(ids), start.centres_px, sigma, everywhere)
+    return _shapes(map_circles(rough, plate.xy_m(ids), plate.radius_m(ids)), plate, ids)
 
 
 def _unseen(plate: Plate, ids: Ids, rough: PlateMap, size: tuple[int, int]) -> Ids:

@@ -6,6 +6,10 @@ maps the ellipse on the unit circle, and ``d = (|q| - 1) / |grad |q||`` the dist
 hole, P0..P2 level of the plate and its slope: uneven light does not move the centre. Least
 squares over the pixels, weighted by the noise found on each side, is the matched filter of every
 edge point and the ellipse fit in one, and its normal equations give the covariance.
+
+A chamfer adds a second step: its outer rim is the same ellipse, larger by the known ratio of the
+diameters and shifted by a parallax that is fitted, with a level between the two that may vary
+around the hole as the slope's light does.
 """
 
 from __future__ import annotations
@@ -17,28 +21,37 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from sl_reconstruct.workers import share_rows
+
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-#: c (2), M (uu, uv, vv), s, D, P0, P1, P2.
-PARAMETERS = 10
-CENTRE, SHAPE, BLUR, DARK, BRIGHT = 0, 2, 5, 6, 7
+#: c (2), M (uu, uv, vv), s, D, P0, P1, P2; with a chamfer its level (3, as P) and its shift (2).
+PARAMETERS = 15
+PLAIN = 10
+CENTRE, SHAPE, BLUR, DARK, BRIGHT, CHAMFER, SHIFT = 0, 2, 5, 6, 7, 10, 13
 
 #: Pixels are used to this many blurs on both sides of the edge: the step's tails end there.
 REACH_BLURS = 4.0
 #: Reach of the first pass, before the blur is known, px.
 FIRST_REACH_PX = 5.0
 MIN_REACH_PX = 2.0
+#: The far side of a chamfer looks this much wider than its width square on (28 degrees: 1.53).
+CHAMFER_STRETCH = 1.6
 #: Share of the way to the next hole's edge, and of the smaller semi-axis, that pixels may take.
 REACH_SHARE = 0.45
 #: Residuals beyond this many sigmas lose weight (Huber).
 HUBER = 2.5
 PASSES = 2
+CHAMFER_PASSES = 3
 ITERATIONS = 12
-#: A step that lowers the cost (half of a chi-square) by less is the last: 0.1 sigma.
-DONE = 5e-3
+#: A step that changes the cost by less than this share of it is the last: with some 1500 pixels
+#: (cost 750) that is a tenth of a sigma of one parameter.
+DONE = 1e-5
 #: Largest part of a semi-axis that a centre may move from where the spot was.
 MAX_SHIFT = 0.5
+SQRT_HALF = math.sqrt(0.5)
+INV_SQRT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
 #: Least noise variance: that of rounding to whole numbers.
 MIN_VARIANCE = 1.0 / 12.0
 
@@ -48,8 +61,8 @@ class HoleFits(NamedTuple):
 
     ``centres_px`` (N, 2) of the ellipses, ``shapes_px2`` (N, 2, 2) as in `Blobs`,
     ``covariance_px2`` (N, 2, 2) of the centres, ``blur_px`` (N,), ``contrast`` (N,) DN,
-    ``misfit`` (N,): rms residual over contrast; ``chi2`` (N,): of the residuals on the edge over
-    those beside it, 1 for a clean edge.
+    ``misfit`` (N,): rms residual over contrast, ``saturated`` (N,): share of the plate beside the
+    hole that is at the top of the scale.
     """
 
     centres_px: Array
@@ -62,7 +75,12 @@ class HoleFits(NamedTuple):
 
 
 def fit_holes(
-    image: Image, centres_px: Array, shapes_px2: Array, gap_px: Array, saturation: float
+    image: Image,
+    centres_px: Array,
+    shapes_px2: Array,
+    gap_px: Array,
+    saturation: float,
+    rim_ratio: Array | None = None,
 ) -> HoleFits:
     """Fit the edges of dark holes.
 
@@ -76,6 +94,8 @@ def fit_holes(
         Bright plate between a hole and its next neighbour.
     saturation : float
         Level at which the sensor is full, in the units of the image; inf for none.
+    rim_ratio : ndarray, (N,), optional
+        Diameter at the top of the chamfer over that at its bottom.
     """
     count = len(centres_px)
     start = np.zeros((count, PARAMETERS))
@@ -86,7 +106,15 @@ def fit_holes(
     out = np.full((count, PARAMETERS), np.nan)
     covariance = np.full((count, 2, 2), np.nan)
     quality = np.full((count, 2), np.nan)
-    _fit_all(image, start, reach, float(saturation), out, covariance, quality)
+    rim = np.ones(count) if rim_ratio is None else rim_ratio
+
+    def work(first: int, last: int) -> None:
+        k = slice(first, last)
+        _fit_all(
+            image, start[k], reach[k], rim[k], float(saturation), out[k], covariance[k], quality[k]
+        )
+
+    share_rows(work, count)
     m = out[:, [SHAPE, SHAPE + 1, SHAPE + 1, SHAPE + 2]].reshape(-1, 2, 2)
     failed = ~np.isfinite(out[:, 0])
     m[failed] = np.eye(2)
@@ -107,20 +135,37 @@ def _inverse_root(shapes_px2: Array) -> Array:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fit_all(
-    image: Any, start: Any, reach: Any, saturation: float, out: Any, covariance: Any, quality: Any
+    image: Any,
+    start: Any,
+    reach: Any,
+    rim: Any,
+    saturation: float,
+    out: Any,
+    covariance: Any,
+    quality: Any,
 ) -> None:
     for k in range(start.shape[0]):
         p = start[k].copy()
-        limit = min(reach[k], FIRST_REACH_PX)
-        good = True
-        for _ in range(PASSES):
-            good = good and _fit(image, p, limit, start[k], covariance[k], quality[k])
+        inner = min(reach[k], FIRST_REACH_PX if rim[k] == 1.0 else MIN_REACH_PX)
+        outer, good = inner, True
+        for i in range(PASSES if rim[k] == 1.0 else CHAMFER_PASSES):
+            ratio = rim[k] if i > 0 else 1.0
+            good = good and _fit(
+                image, p, (inner, outer, ratio), start[k], covariance[k], quality[k]
+            )
             if not good:
                 break
-            limit = min(reach[k], max(REACH_BLURS * p[BLUR], MIN_REACH_PX))
+            inner = min(reach[k], max(REACH_BLURS * p[BLUR], MIN_REACH_PX))
+            outer = inner + CHAMFER_STRETCH * (rim[k] - 1.0) / math.sqrt(_det(p))
         if good:
             out[k] = p
-            quality[k, 1] = _saturated_share(image, p, limit, saturation)
+            quality[k, 1] = _saturated_share(image, p, (inner, outer), saturation)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _det(p: Any) -> Any:
+    """Determinant of M: one over the product of the semi-axes."""
+    return p[2] * p[4] - p[3] * p[3]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -148,9 +193,9 @@ def _window(p: Any, limit: float, shape: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _gather(image: Any, p: Any, limit: float) -> Any:
+def _gather(image: Any, p: Any, limits: Any) -> Any:
     """Pixels (K, 3) = (u, v, level) within reach of the edge; none where the image ends."""
-    u0, u1, v0, v1, inside = _window(p, limit, image.shape)
+    u0, u1, v0, v1, inside = _window(p, limits[1], image.shape)
     if not inside or (u1 - u0) * (v1 - v0) > 400000:
         return np.empty((0, 3))
     pixels = np.empty(((u1 - u0 + 1) * (v1 - v0 + 1), 3))
@@ -158,55 +203,77 @@ def _gather(image: Any, p: Any, limit: float) -> Any:
     for v in range(v0, v1 + 1):
         for u in range(u0, u1 + 1):
             _, _, rho, steep = _distance(p, u, v)
-            if abs(rho - 1.0) <= limit * steep:
+            if -limits[0] * steep <= rho - 1.0 <= limits[1] * steep:
                 pixels[count, 0], pixels[count, 1], pixels[count, 2] = u, v, image[v, u]
                 count += 1
     return pixels[:count]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _start_levels(pixels: Any, p: Any, limit: float) -> None:
-    """Put the mean levels on both sides, and a blur of 1 px, into the parameters."""
+def _start_levels(pixels: Any, p: Any, limits: Any) -> None:
+    """Put the mean levels at the ends of the reach, and a blur of 1 px, into the parameters."""
     sums = np.zeros((2, 2))
     for k in range(pixels.shape[0]):
         _, _, rho, steep = _distance(p, pixels[k, 0], pixels[k, 1])
         d = (rho - 1.0) / steep
-        if abs(d) > 0.5 * limit:
+        if d > limits[1] - 0.5 * limits[0] or d < -0.5 * limits[0]:
             side = 1 if d > 0 else 0
             sums[side, 0] += pixels[k, 2]
             sums[side, 1] += 1.0
-    p[BLUR] = 1.0
+    if p[BLUR] == 0.0:
+        p[BLUR] = 1.0
     p[DARK] = sums[0, 0] / max(sums[0, 1], 1.0)
     p[BRIGHT] = sums[1, 0] / max(sums[1, 1], 1.0)
     p[BRIGHT + 1], p[BRIGHT + 2] = 0.0, 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _model(p: Any, x: float, y: float, row: Any) -> Any:
+def _rim_step(p: Any, q1: float, q2: float, ratio: float, step: float) -> Any:
+    """Phi of the chamfer's upper rim, its derivative over q (2), and over the blur."""
+    r1, r2 = (q1 - p[SHIFT]) / ratio, (q2 - p[SHIFT + 1]) / ratio
+    rho = max(math.sqrt(r1 * r1 + r2 * r2), 1e-9)
+    g1, g2 = p[2] * r1 + p[3] * r2, p[3] * r1 + p[4] * r2
+    steep = max(math.sqrt(g1 * g1 + g2 * g2) / (rho * ratio), 1e-9)
+    t = (rho - 1.0) / (steep * p[BLUR])
+    by_d = step * INV_SQRT_2PI * math.exp(-0.5 * t * t) / p[BLUR]
+    by_q = by_d / (steep * rho * ratio)
+    return 0.5 * math.erfc(-t * SQRT_HALF), by_q * r1, by_q * r2, -by_d * t
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _model(p: Any, x: float, y: float, ratio: float, row: Any) -> Any:
     """Level of a pixel; its derivatives go to ``row``. Returns (level, Phi)."""
     q1, q2, rho, steep = _distance(p, x, y)
     dx, dy = x - p[0], y - p[1]
     t = (rho - 1.0) / (steep * p[BLUR])
-    phi = 0.5 * math.erfc(-t * 0.7071067811865476)
+    phi = 0.5 * math.erfc(-t * SQRT_HALF)
     bright = p[BRIGHT] + p[BRIGHT + 1] * q1 + p[BRIGHT + 2] * q2
-    step = bright - p[DARK]
-    by_d = step * 0.3989422804014327 * math.exp(-0.5 * t * t) / p[BLUR]
-    by_rho = by_d / (steep * rho)
-    row[0] = -by_rho * (p[2] * q1 + p[3] * q2)
-    row[1] = -by_rho * (p[3] * q1 + p[4] * q2)
-    row[2], row[3], row[4] = by_rho * q1 * dx, by_rho * (q1 * dy + q2 * dx), by_rho * q2 * dy
-    row[BLUR] = -by_d * t
+    by1, by2, rim, level = 0.0, 0.0, phi, bright
+    if ratio > 1.0:
+        level = p[CHAMFER] + p[CHAMFER + 1] * q1 + p[CHAMFER + 2] * q2
+        rim, by1, by2, row[BLUR] = _rim_step(p, q1, q2, ratio, bright - level)
+        row[SHIFT], row[SHIFT + 1] = -by1, -by2
+        between = phi - rim
+        row[CHAMFER], row[CHAMFER + 1], row[CHAMFER + 2] = between, between * q1, between * q2
+    else:
+        row[BLUR] = 0.0
+    by_d = (level - p[DARK]) * INV_SQRT_2PI * math.exp(-0.5 * t * t) / p[BLUR]
+    by1, by2 = by1 + by_d / (steep * rho) * q1, by2 + by_d / (steep * rho) * q2
+    row[0] = -(p[2] * by1 + p[3] * by2)
+    row[1] = -(p[3] * by1 + p[4] * by2)
+    row[2], row[3], row[4] = by1 * dx, by1 * dy + by2 * dx, by2 * dy
+    row[BLUR] -= by_d * t
     row[DARK] = 1.0 - phi
-    row[BRIGHT], row[BRIGHT + 1], row[BRIGHT + 2] = phi, phi * q1, phi * q2
-    return p[DARK] + step * phi, phi
+    row[BRIGHT], row[BRIGHT + 1], row[BRIGHT + 2] = rim, rim * q1, rim * q2
+    return p[DARK] + (level - p[DARK]) * phi + (bright - level) * rim, phi
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _noise(pixels: Any, p: Any, row: Any) -> Any:
+def _noise(pixels: Any, p: Any, ratio: float, row: Any) -> Any:
     """Variances in the hole and on the plate, from the residuals beside the edge."""
     sums = np.zeros((2, 2))
     for k in range(pixels.shape[0]):
-        level, phi = _model(p, pixels[k, 0], pixels[k, 1], row)
+        level, phi = _model(p, pixels[k, 0], pixels[k, 1], ratio, row)
         if phi < 0.02 or phi > 0.98:
             side = 1 if phi > 0.5 else 0
             sums[side, 0] += (pixels[k, 2] - level) ** 2
@@ -218,24 +285,25 @@ def _noise(pixels: Any, p: Any, row: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _normal(pixels: Any, p: Any, noise: Any, row: Any, a: Any, b: Any) -> Any:
+def _normal(pixels: Any, p: Any, ratio: float, noise: Any, row: Any, a: Any, b: Any) -> Any:
     """Weighted normal equations; returns the cost (Huber) and the plain sums."""
     a[:] = 0.0
     b[:] = 0.0
     cost, squares = 0.0, 0.0
+    count = PLAIN if ratio == 1.0 else PARAMETERS
     for k in range(pixels.shape[0]):
-        level, phi = _model(p, pixels[k, 0], pixels[k, 1], row)
+        level, phi = _model(p, pixels[k, 0], pixels[k, 1], ratio, row)
         r = pixels[k, 2] - level
         variance = noise[0] + (noise[1] - noise[0]) * phi
         z = abs(r) / math.sqrt(variance)
         weight = (1.0 if z < HUBER else HUBER / z) / variance
         cost += 0.5 * z * z if z < HUBER else HUBER * (z - 0.5 * HUBER)
         squares += r * r
-        for i in range(PARAMETERS):
+        for i in range(count):
             b[i] += weight * row[i] * r
             for j in range(i + 1):
                 a[i, j] += weight * row[i] * row[j]
-    for i in range(PARAMETERS):
+    for i in range(count):
         for j in range(i):
             a[j, i] = a[i, j]
     return cost, squares
@@ -260,25 +328,30 @@ def _sane(p: Any, start: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _descend(pixels: Any, p: Any, noise: Any, row: Any, a: Any, b: Any, start: Any) -> Any:
+def _descend(
+    pixels: Any, p: Any, ratio: float, noise: Any, row: Any, a: Any, b: Any, start: Any
+) -> Any:
     """Levenberg-Marquardt on the parameters in place; returns the sum of squares, a as at p."""
-    cost, squares = _normal(pixels, p, noise, row, a, b)
+    cost, squares = _normal(pixels, p, ratio, noise, row, a, b)
     trial_a, trial_b = np.empty_like(a), np.empty_like(b)
     damping = 1e-4
     for _ in range(ITERATIONS):
         damped = a.copy()
-        for i in range(PARAMETERS):
+        for i in range(a.shape[0]):
             damped[i, i] += damping * a[i, i] + 1e-12
-        trial = p + np.linalg.solve(damped, b)
+        trial = p.copy()
+        trial[: a.shape[0]] += np.linalg.solve(damped, b)
         if _sane(trial, start):
-            trial_cost, trial_squares = _normal(pixels, trial, noise, row, trial_a, trial_b)
-            if trial_cost <= cost:
-                done = cost - trial_cost < DONE
+            trial_cost, trial_squares = _normal(pixels, trial, ratio, noise, row, trial_a, trial_b)
+            done = abs(cost - trial_cost) < DONE * cost
+            better = trial_cost <= cost
+            if better:
                 p[:], a[:], b[:] = trial, trial_a, trial_b
                 cost, squares = trial_cost, trial_squares
                 damping *= 0.1
-                if done:
-                    break
+            if done:
+                break
+            if better:
                 continue
         damping *= 10.0
         if damping > 1e6:
@@ -287,37 +360,41 @@ def _descend(pixels: Any, p: Any, noise: Any, row: Any, a: Any, b: Any, start: A
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fit(image: Any, p: Any, limit: float, start: Any, covariance: Any, quality: Any) -> Any:
-    """One pass: gather pixels, find the noise, descend; False where there is no hole."""
-    pixels = _gather(image, p, limit)
-    if pixels.shape[0] < 3 * PARAMETERS:
+def _fit(image: Any, p: Any, reach: Any, start: Any, covariance: Any, quality: Any) -> Any:
+    """One pass: gather pixels, find the noise, descend; False where there is no hole.
+
+    ``reach`` is (px inside the edge, px outside, ratio of the rim).
+    """
+    inner, outer, ratio = reach
+    count = PLAIN if ratio == 1.0 else PARAMETERS
+    pixels = _gather(image, p, (inner, outer))
+    if pixels.shape[0] < 3 * count:
         return False
-    if p[BLUR] == 0.0:
-        _start_levels(pixels, p, limit)
-    if not p[BRIGHT] - p[DARK] > 1.0:
-        return False
-    row, a, b = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
-    noise = _noise(pixels, p, row)
-    squares = _descend(pixels, p, noise, row, a, b, start)
+    if p[BLUR] == 0.0 or (ratio > 1.0 and p[CHAMFER] == 0.0):
+        chamfer = p[BRIGHT]  # a narrow reach sees no further than the chamfer
+        _start_levels(pixels, p, (inner, outer))
+        p[CHAMFER] = chamfer
+    row, a, b = np.zeros(PARAMETERS), np.zeros((count, count)), np.zeros(count)
+    noise = _noise(pixels, p, ratio, row)
+    squares = _descend(pixels, p, ratio, noise, row, a, b, start)
     contrast = p[BRIGHT] - p[DARK]
     if not (contrast > 1.0 and _sane(p, start)):
         return False
-    for i in range(PARAMETERS):
+    for i in range(count):
         a[i, i] += 1e-12 * (1.0 + a[i, i])
-    inverse = np.linalg.inv(a)
-    covariance[:] = inverse[:2, :2]
+    covariance[:] = np.linalg.inv(a)[:2, :2]
     quality[0] = math.sqrt(squares / pixels.shape[0]) / contrast
     return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _saturated_share(image: Any, p: Any, limit: float, saturation: float) -> float:
+def _saturated_share(image: Any, p: Any, limits: Any, saturation: float) -> float:
     """Share of the plate's pixels beside the edge that are at the top of the scale."""
-    pixels = _gather(image, p, limit)
+    pixels = _gather(image, p, limits)
     full, count = 0, 0
     for k in range(pixels.shape[0]):
         _, _, rho, steep = _distance(p, pixels[k, 0], pixels[k, 1])
-        if rho - 1.0 > 0.5 * limit * steep:
+        if rho - 1.0 > (limits[1] - 0.5 * limits[0]) * steep:
             count += 1
             if pixels[k, 2] >= saturation:
                 full += 1

@@ -84,14 +84,14 @@ def place(plate: Plate, found: FoundLattice) -> Placement:
     """Lay the plate on the lattice.
 
     Without a mark, of the rotations that explain the image equally well the one is taken whose
-    plate x is nearest to image right; a corner mark on a square plate leaves no doubt but that of
-    the side, and the front is taken.
+    plate x is nearest to image right. A corner mark on a plate with as many columns as rows leaves
+    the side in doubt; the front is taken.
 
     Raises
     ------
     CalibrationError
-        When the lattice does not fit on the plate, more than one offset explains it equally well,
-        or the plate shows its back.
+        When the lattice does not fit on the plate, more than one offset (with a mark: or rotation)
+        explains it equally well, or the plate shows its back.
     """
     options = [option for turn, mirrored in _turns(found) for option in _shifts(plate, found, turn,
                mirrored)]  # fmt: skip
@@ -109,7 +109,7 @@ def place(plate: Plate, found: FoundLattice) -> Placement:
             f"expected the front, with the mark at hole {plate.origin_id}"
         )
     level = [o for o in options if not o.mirrored and o.unexplained == front]
-    return _upright(found, level)
+    return _upright(found, level, plate.origin_diameter_m is not None)
 
 
 def _turns(found: FoundLattice) -> list[tuple[Ids, bool]]:
@@ -149,8 +149,8 @@ def _unexplained(plate: Plate, found: FoundLattice, turn: Ids, shift: Ids) -> in
     return lost + MARK_WEIGHT * int(np.sum(at_origin != found.marks))
 
 
-def _upright(found: FoundLattice, level: list[Placement]) -> Placement:
-    """Take the placement whose x is nearest to image right; refuse when offsets remain."""
+def _upright(found: FoundLattice, level: list[Placement], marked: bool) -> Placement:
+    """Take the placement whose x is nearest to image right; refuse when more than that is open."""
     middle = found.ij.mean(axis=0)
 
     def right(option: Placement) -> float:
@@ -158,10 +158,10 @@ def _upright(found: FoundLattice, level: list[Placement]) -> Placement:
         return float(step[0] / np.hypot(*step))
 
     best = max(level, key=right)
-    rivals = [o for o in level if np.array_equal(o.turn, best.turn)]
+    rivals = [o for o in level if marked or np.array_equal(o.turn, best.turn)]
     if len(rivals) > 1:
         raise CalibrationError(
-            f"part of the plate is out of view and its holes fit at {len(rivals)} offsets; "
-            f"expected the origin mark or two neighbouring sides of the plate in view"
+            f"part of the plate is out of view and its holes fit at {len(rivals)} offsets or "
+            f"rotations; expected the origin mark or two neighbouring sides of the plate in view"
         )
     return best
