@@ -25,7 +25,8 @@ from sl_bench.reference import reference_rig  # noqa: E402
 from sl_bringup.transport import Transport, process_environment  # noqa: E402
 from sl_projector.base_node import LARGE  # noqa: E402
 from sl_reconstruct.calibration_file import rig_hash, save_calibration  # noqa: E402
-from sl_reconstruct.messages import cloud_from_msg, cloud_hash  # noqa: E402
+from sl_reconstruct.cloud_files import cloud_hash  # noqa: E402
+from sl_reconstruct.messages import cloud_from_msg  # noqa: E402
 
 #: Where the stage puts the plate; a whole number of the emulated stage's steps.
 HEIGHT_M = 0.2e-3

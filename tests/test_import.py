@@ -11,7 +11,7 @@ import pytest
 from sl_bringup.bags import CALIBRATION, IMAGE, POSE, TRIGGER, open_bag
 from sl_bringup.cli import main
 from sl_bringup.importer import import_folder, scan_folders
-from sl_bringup.replay import stamp_ns
+from sl_camera.message_fields import stamp_ns
 from sl_projector.errors import BagError, StackError
 from sl_projector.sequence import named
 from sl_projector.sequence_file import SequenceFile, load_sequence_file

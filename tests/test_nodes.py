@@ -51,7 +51,8 @@ from sl_reconstruct.calibration_file import (  # noqa: E402
     rig_hash,
     save_calibration,
 )
-from sl_reconstruct.messages import cloud_from_msg, cloud_hash  # noqa: E402
+from sl_reconstruct.cloud_files import cloud_hash  # noqa: E402
+from sl_reconstruct.messages import cloud_from_msg  # noqa: E402
 from sl_reconstruct.reconstruct_node import ReconstructNode  # noqa: E402
 from tiny_scans import HEIGHT_M, SLOPE, render, tiny_rig, tiny_sequence  # noqa: E402
 

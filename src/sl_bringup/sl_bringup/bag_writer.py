@@ -54,7 +54,8 @@ QOS_DEPTH = 64
 _FOREVER = QosTime(9223372036, 854775807)
 
 
-def _qos(topic: Topic) -> Qos:
+def topic_qos(topic: Topic) -> Qos:
+    """What a player shall offer: all reliable, deep enough for a whole sequence."""
     return Qos(
         QosHistory.KEEP_LAST,
         1 if topic.latched else QOS_DEPTH,
@@ -83,7 +84,7 @@ class BagWriter:
                 f"{self._namespace}/{topic.name}",
                 topic.msgtype,
                 typestore=typestore(),
-                offered_qos_profiles=[_qos(topic)],
+                offered_qos_profiles=[topic_qos(topic)],
             )
         data = typestore().serialize_cdr(message, topic.msgtype)
         self._writer.write(self._connections[topic], stamp_ns, data)

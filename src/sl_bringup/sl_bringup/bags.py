@@ -23,13 +23,9 @@ from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from sl_bringup.mended_mcap import MendedPath
+from sl_bringup.mcap_reader import McapFile
+from sl_bringup.mcap_records import zstd
 from sl_projector.errors import BagError
-
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:  # what rosbags itself depends on
-    from backports import zstd
 
 
 @dataclass(frozen=True)
@@ -55,7 +51,18 @@ TRIGGER = Topic("projector/trigger", "sl_interfaces/msg/PatternTrigger")
 IMAGE = Topic("camera/image_raw", "sensor_msgs/msg/Image")
 POSE = Topic("stage/pose", "geometry_msgs/msg/PoseStamped")
 CALIBRATION = Topic("calibration/rig", "sl_interfaces/msg/RigCalibration", latched=True)
+#: What an evaluation reads.
 TOPICS = (TRIGGER, IMAGE, POSE, CALIBRATION)
+
+CAMERA_INFO = Topic("camera/camera_info", "sensor_msgs/msg/CameraInfo")
+PROJECTOR_INFO = Topic("projector/camera_info", "sensor_msgs/msg/CameraInfo", latched=True)
+#: What the live graph made of it: verdicts of the matching, results, settings.
+FRAME = Topic("synchronizer/frame", "sl_interfaces/msg/MatchedFrame")
+REPORT = Topic("reconstruct/report", "sl_interfaces/msg/ScanReport")
+SETTINGS = Topic("reconstruct/settings", "std_msgs/msg/String", latched=True)
+#: What comes from the devices, and what `slrig record` records.
+RAW_TOPICS = (TRIGGER, IMAGE, CAMERA_INFO, POSE, CALIBRATION, PROJECTOR_INFO)
+RECORDED_TOPICS = (*RAW_TOPICS, FRAME, REPORT, SETTINGS)
 
 DEFAULT_NAMESPACE = "/sl"
 
@@ -108,7 +115,7 @@ class Recorded:
     Parameters
     ----------
     topic : Topic
-        Which of `TOPICS` it is.
+        Which topic it is of.
     received_ns : int
         When it was recorded, nanoseconds since the epoch.
     message : object
@@ -120,13 +127,32 @@ class Recorded:
     message: Any
 
 
+@dataclass(frozen=True)
+class Raw:
+    """One message as it was on the wire.
+
+    Parameters
+    ----------
+    topic : Topic
+        Which topic it is of.
+    received_ns : int
+        When it was recorded, nanoseconds since the epoch.
+    data : buffer
+        CDR with its header.
+    """
+
+    topic: Topic
+    received_ns: int
+    data: bytes | memoryview
+
+
 class _Storage(Protocol):
     @property
     def connections(self) -> list[Connection]: ...
 
     def messages(
         self, connections: Sequence[Connection]
-    ) -> Iterator[tuple[Connection, int, bytes]]: ...
+    ) -> Iterator[tuple[Connection, int, bytes | memoryview]]: ...
 
 
 @dataclass(frozen=True)
@@ -140,7 +166,7 @@ class _File:
     name: str
     storage: _Storage
     digests: Mapping[str, str] = field(default_factory=dict)
-    unpack: Callable[[bytes], bytes] = bytes
+    unpack: Callable[[bytes], bytes] | None = None
 
 
 @dataclass
@@ -165,41 +191,70 @@ class Bag:
     notes: list[str] = field(default_factory=list)
     _files: list[_File] = field(default_factory=list)
 
-    def messages(self, *topics: Topic) -> Iterator[Recorded]:
+    def messages(self, *topics: Topic, quick: bool = False) -> Iterator[Recorded]:
         """Yield the messages of the given topics (default: all of `TOPICS`) as recorded.
+
+        Parameters
+        ----------
+        topics : Topic
+            Which.
+        quick : bool
+            Pick few messages out of many, without a look at checksums.
 
         Raises
         ------
         BagError
             When a message does not fit its definition.
         """
-        wanted = {f"{self.namespace}/{topic.name}": topic for topic in topics or TOPICS}
+        for raw in self.raw(*topics or TOPICS, quick=quick):
+            yield Recorded(raw.topic, raw.received_ns, _decode(raw.data, raw.topic, self.path))
+
+    def raw(self, *topics: Topic, quick: bool = False) -> Iterator[Raw]:
+        """Yield the messages of the given topics as they were on the wire."""
+        wanted = {f"{self.namespace}/{topic.name}": topic for topic in topics}
         for file in self._files:
             connections = [c for c in file.storage.connections if c.topic in wanted]
             if connections:
-                yield from self._read(file, connections, wanted)
+                yield from self._read(file, connections, wanted, quick)
+
+    def has(self, topic: Topic) -> bool:
+        """Whether the topic is in the bag."""
+        return f"{self.namespace}/{topic.name}" in topic_names(self)
+
+    def lose(self, line: str) -> None:
+        """Note once what could not be read."""
+        if line not in self.lost:
+            self.lost.append(line)
 
     def _read(
-        self, file: _File, connections: Sequence[Connection], wanted: Mapping[str, Topic]
-    ) -> Iterator[Recorded]:
+        self,
+        file: _File,
+        connections: Sequence[Connection],
+        wanted: Mapping[str, Topic],
+        quick: bool,
+    ) -> Iterator[Raw]:
         for connection in connections:
             digest = connection.digest or file.digests.get(connection.topic, "")
             _check_type(connection, digest, wanted[connection.topic], self.path)
-        messages = file.storage.messages(connections)
+        storage = file.storage
+        messages = (
+            storage.messages(connections, check=not quick)
+            if isinstance(storage, McapFile)
+            else storage.messages(connections)
+        )
         while True:
             try:
                 connection, received_ns, packed = next(messages)
-                data = file.unpack(packed)
+                data = file.unpack(bytes(packed)) if file.unpack else packed
             except StopIteration:
                 return
             except Exception as exc:  # a damaged file makes the reader fail in any way it can
-                self.lost.append(f"{file.name}: unreadable from here on ({_reason(exc)})")
+                self.lose(f"{file.name}: unreadable from here on ({_reason(exc)})")
                 return
-            topic = wanted[connection.topic]
-            yield Recorded(topic, received_ns, _decode(data, topic, self.path))
+            yield Raw(wanted[connection.topic], received_ns, data)
 
 
-def _decode(data: bytes, topic: Topic, path: Path) -> Any:
+def _decode(data: bytes | memoryview, topic: Topic, path: Path) -> Any:
     try:
         return typestore().deserialize_cdr(data, topic.msgtype)
     except Exception as exc:
@@ -257,7 +312,7 @@ def _open_files(bag: Bag, stack: ExitStack) -> None:
         _refuse_formats(exc, bag.path)
         no_metadata = isinstance(exc, FileNotFoundError)
         why = "no metadata.yaml, read file by file" if no_metadata else _reason(exc)
-        (bag.notes if no_metadata else bag.lost).append(f"{bag.path.name}: {why}")
+        (bag.notes.append if no_metadata else bag.lose)(f"{bag.path.name}: {why}")
         for path in _storage_files(bag.path):
             bag._files += _open_damaged(bag, path, stack)
         if not bag._files:
@@ -285,16 +340,33 @@ def _open_directory(bag: Bag, path: Path, stack: ExitStack) -> list[_File]:
     stack.callback(reader.close)
     held = sum(c.msgcount for storage in reader.storages for c in storage.connections)
     if held != reader.metadata.message_count:
-        bag.lost.append(
+        bag.lose(
             f"{path.name}: the files hold {held} messages, {reader.metadata.message_count} were "
             "recorded"
         )
-    unpack = zstd.decompress if reader.metadata.compression_mode == "message" else bytes
+    unpack = zstd.decompress if reader.metadata.compression_mode == "message" else None
     digests = {c.topic: c.digest for c in reader.connections}
-    return [_File(path.name, storage, digests, unpack) for storage in reader.storages]
+    return [
+        _File(path.name, _fast(bag, storage, stack), digests, unpack) for storage in reader.storages
+    ]
+
+
+def _fast(bag: Bag, storage: Any, stack: ExitStack) -> _Storage:
+    return _open_mcap(bag, Path(storage.path), stack) if isinstance(storage, McapReader) else storage
+
+
+def _open_mcap(bag: Bag, path: Path, stack: ExitStack) -> McapFile:
+    file = McapFile(path, bag.lose)
+    stack.callback(file.close)
+    return file
 
 
 def _open_file(bag: Bag, path: Path, stack: ExitStack) -> list[_File]:
+    """Open one file, of an mcap file that is damaged what is whole."""
+    if path.suffix == ".mcap":
+        mcap = _open_mcap(bag, path, stack)
+        _check_cdr(mcap.connections)
+        return [_File(path.name, mcap)]
     reader = Reader(path)
     reader.open()
     stack.callback(reader.close)
@@ -317,47 +389,14 @@ def _storage_files(path: Path) -> list[Path]:
 
 
 def _open_damaged(bag: Bag, path: Path, stack: ExitStack) -> list[_File]:
-    """Open a file; of a damaged mcap file the whole records, of any other damaged file nothing."""
+    """Open a file if that is possible."""
     try:
         return _open_file(bag, path, stack)
     except Exception as exc:
         _refuse_formats(exc, path)
         if path != bag.path:
-            bag.lost.append(f"{path.name}: {_reason(exc)}")
-    mended = MendedPath(path) if path.suffix == ".mcap" else None
-    return _open_mended(bag, mended, stack) if mended and mended.intact else []
-
-
-def _open_mended(bag: Bag, mended: MendedPath, stack: ExitStack) -> list[_File]:
-    reader, path = _MendedMcap(mended), mended.path
-    try:
-        reader.open()
-        stack.callback(reader.close)
-        _check_cdr(reader.connections)
-    except Exception as exc:
-        _refuse_formats(exc, path)
-        bag.lost.append(f"{path.name}: {_reason(exc)}")
-        return []
-    size = path.stat().st_size
-    bag.lost.append(
-        f"{path.name}: the end is missing; {size - mended.intact} of {size} bytes are unreadable"
-    )
-    return [_File(path.name, reader)]
-
-
-class _MendedMcap(McapReader):
-    """Reads records as they come: an mcap file without index need not be in order of time."""
-
-    def __init__(self, path: MendedPath) -> None:
-        super().__init__(path)  # type: ignore[arg-type]
-
-    def messages(
-        self,
-        connections: Any,
-        start: int | None = None,
-        stop: int | None = None,
-    ) -> Any:
-        return self.messages_scan(connections, start, stop)
+            bag.lose(f"{path.name}: {_reason(exc)}")
+    return []
 
 
 def _namespace(bag: Bag, wanted: str | None) -> str:

@@ -62,7 +62,7 @@ class Calibrations:
 
 def _recorded_calibrations(bag: Bag) -> list[InForce]:
     found = []
-    for recorded in bag.messages(CALIBRATION):
+    for recorded in bag.messages(CALIBRATION, quick=True):
         message = recorded.message
         calibration = parse_calibration(message.yaml, f"{bag.path}: {CALIBRATION.name}")
         if message.hash and message.hash != calibration.hash:

@@ -24,7 +24,9 @@ COMMANDS: tuple[tuple[str, str, str], ...] = (
     ("doctor", "sl_bringup.doctor", "say what is missing on this machine, and what to do"),
     ("patterns", "sl_bringup.patterns", "write a sequence's file and its frames as PNG"),
     ("import", "sl_bringup.importer", "make a recording of a folder of images"),
-    ("evaluate", "sl_bringup.evaluate", "recording to clouds, reports and pictures"),
+    ("record", "sl_bringup.record", "record what an evaluation needs"),
+    ("replay", "sl_bringup.replay", "publish a recording as the devices did"),
+    ("evaluate", "sl_bringup.evaluate", "recordings to clouds, reports and pictures"),
 )
 
 OVERVIEW = "\n".join(f"  {name:<10} {line}" for name, _, line in COMMANDS)

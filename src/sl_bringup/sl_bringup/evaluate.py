@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from sl_bringup.bags import TRIGGER, Bag, open_bag, topic_names
 from sl_bringup.calibrations import Calibrations
 from sl_bringup.progress import Progress, complain, say
-from sl_bringup.replay import decisions
+from sl_bringup.stacks import decisions
 from sl_bringup.report import page, verdict_line, write_json, write_page
 from sl_bringup.scan_files import clear_scan, write_scan
 from sl_camera.matching import FrameDecision, MatchedStack, MatcherSettings, StackMatcher, Status
@@ -123,14 +123,12 @@ def _clear(output: Path) -> None:
 
 def _count_scans(bag: Bag) -> int:
     """Scans that were begun; refuses a bag without triggers, and says what it has instead."""
-    known = len(bag.lost)
-    scans = {m.message.scan_id for m in bag.messages(TRIGGER)}
+    scans = {m.message.scan_id for m in bag.messages(TRIGGER, quick=True)}
     if not scans:
         raise BagError(
             f"{bag.path} has no triggers on {bag.namespace}/{TRIGGER.name}{_lost(bag)}; its topics "
             f"are {', '.join(topic_names(bag)) or 'none'}"
         )
-    del bag.lost[known:]  # told again when the messages are read for good
     return len(scans)
 
 

@@ -72,3 +72,27 @@ class Progress:
         else:
             sys.stderr.write(f"{self._what}: {counted}\n")
         sys.stderr.flush()
+
+
+class StatusLine:
+    """How work stands that has no known end: a line that overwrites itself, in a log now and then.
+
+    Parameters
+    ----------
+    what : str
+        The work.
+    """
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._terminal = sys.stderr.isatty()
+        self._next_s = time.monotonic() + _LOG_S
+
+    def show(self, text: str) -> None:
+        """Tell how it stands."""
+        if self._terminal:
+            sys.stderr.write(f"\r{self._what}: {text} ")
+            sys.stderr.flush()
+        elif time.monotonic() >= self._next_s:
+            self._next_s = time.monotonic() + _LOG_S
+            complain(f"{self._what}: {text}")

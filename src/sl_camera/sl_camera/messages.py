@@ -1,4 +1,4 @@
-"""Images, poses, verdicts and stacks as ROS messages and back.
+"""Images, poses, verdicts and stacks as ROS messages; `message_fields` has the way back.
 
 Pixels are not copied where that can be avoided: rclpy's setter of ``uint8[]`` fields copies into
 an ``array.array`` (0.15 s for an image given as ndarray), but its serialisation takes anything
@@ -13,23 +13,11 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
-from sl_interfaces.msg import MatchedFrame, PatternStack, PatternTrigger
+from sl_interfaces.msg import MatchedFrame, PatternStack
 
-from sl_camera.match_events import (
-    PIXEL_TYPES,
-    FrameDecision,
-    ImageEvent,
-    MatchedStack,
-    PoseEvent,
-    TriggerEvent,
-)
+from sl_camera.match_events import PIXEL_TYPES, FrameDecision, MatchedStack, PoseEvent
 from sl_camera.stage import Position
-from sl_projector.messages import (
-    pattern_from_msg,
-    pattern_to_msg,
-    stamp_from_msg,
-    stamp_to_msg,
-)
+from sl_projector.messages import pattern_to_msg, stamp_to_msg
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
@@ -66,25 +54,6 @@ def _bytes_of(pixels: Pixels) -> NDArray[np.uint8]:
     return np.ascontiguousarray(pixels).reshape(-1).view(np.uint8)
 
 
-def image_event(message: Image) -> ImageEvent:
-    """One image for the matcher, which also judges it; its rows have no padding any more.
-
-    Big-endian pixels are turned round. A message whose numbers do not fit each other is passed on
-    as it is: the matcher says what is wrong with it.
-    """
-    data = np.frombuffer(message.data, np.uint8)
-    size = PIXEL_TYPES[message.encoding].itemsize if message.encoding in PIXEL_TYPES else 1
-    row_bytes = message.width * size
-    if message.step > row_bytes and data.size == message.step * message.height:
-        data = np.ascontiguousarray(data.reshape(message.height, message.step)[:, :row_bytes])
-    if size == 2 and message.is_bigendian and data.size % 2 == 0:
-        data = data.reshape(-1).view(">u2").astype("<u2")
-    flat = data.reshape(-1).view(np.uint8)
-    return ImageEvent(
-        stamp_from_msg(message.header.stamp), message.height, message.width, message.encoding, flat
-    )
-
-
 def camera_info_for(template: CameraInfo | None, image: Image) -> CameraInfo:
     """Return the camera info that goes with an image: same stamp, frame and size.
 
@@ -95,37 +64,6 @@ def camera_info_for(template: CameraInfo | None, image: Image) -> CameraInfo:
         info = template
     info.header = image.header
     return info
-
-
-def trigger_event(message: PatternTrigger) -> TriggerEvent:
-    """One trigger for the matcher.
-
-    Raises
-    ------
-    SequenceError
-        When its pattern is none.
-    """
-    return TriggerEvent(
-        scan_id=message.scan_id,
-        sequence_name=message.sequence,
-        dmd_size=(message.dmd_columns, message.dmd_rows),
-        index=message.index,
-        count=message.count,
-        pattern=pattern_from_msg(message.pattern),
-        stamp_ns=stamp_from_msg(message.header.stamp),
-        exposure_s=message.exposure_s,
-    )
-
-
-def pose_event(message: PoseStamped) -> PoseEvent:
-    """One pose for the matcher, which also judges it."""
-    p, q = message.pose.position, message.pose.orientation
-    return PoseEvent(
-        stamp_from_msg(message.header.stamp),
-        (p.x, p.y, p.z),
-        (q.x, q.y, q.z, q.w),
-        message.header.frame_id,
-    )
 
 
 def pose_to_msg(pose: PoseEvent | None) -> PoseStamped:

@@ -11,13 +11,8 @@ from sl_interfaces.msg import MatchedFrame, PatternStack, PatternTrigger
 
 from sl_camera.match_events import FrameDecision, MatchedStack, MatcherSettings, Status
 from sl_camera.matching import StackMatcher
-from sl_camera.messages import (
-    decision_to_msg,
-    image_event,
-    pose_event,
-    stack_to_msg,
-    trigger_event,
-)
+from sl_camera.message_fields import image_event, pose_event, trigger_event
+from sl_camera.messages import decision_to_msg, stack_to_msg
 from sl_projector.base_node import CAMERA_FRAME, EVENTS, IMAGES, LARGE, Health, RigNode, run
 
 #: While a scan is open, time-outs and the settling time are looked at so often.

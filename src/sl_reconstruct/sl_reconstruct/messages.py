@@ -6,7 +6,6 @@ shares the cloud's memory until it is published (rclpy serialises anything with 
 
 from __future__ import annotations
 
-import hashlib
 import math
 from dataclasses import dataclass
 from itertools import pairwise
@@ -22,6 +21,7 @@ from sl_projector.errors import SequenceError, StackError
 from sl_projector.messages import sequence_from_msgs, stamp_from_msg, stamp_to_msg
 from sl_projector.sequence import PatternSequence
 from sl_reconstruct.calibration_file import Calibration, dump_calibration
+from sl_reconstruct.cloud_files import cloud_hash
 from sl_reconstruct.plumb_bob import plumb_bob
 from sl_reconstruct.rig import Device, Rig
 from sl_reconstruct.workshop import Product
@@ -161,11 +161,6 @@ def report_to_msg(product: Product, stack: Stack) -> ScanReport:
         settings_hash=product.settings_hash,
         cloud_hash=cloud_hash(cloud.points),
     )
-
-
-def cloud_hash(points: NDArray[Any]) -> str:
-    """Hexadecimal SHA-256 of a cloud's points as they are in a message."""
-    return hashlib.sha256(np.ascontiguousarray(points).data.cast("B")).hexdigest()
 
 
 def cloud_from_msg(message: PointCloud2) -> NDArray[Any]:

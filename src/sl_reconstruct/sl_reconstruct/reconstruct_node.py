@@ -7,6 +7,7 @@ executor's thread only hands over.
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections import deque
@@ -24,6 +25,7 @@ from sl_interfaces.action import Scan
 from sl_interfaces.msg import MatchedFrame, PatternStack, RigCalibration, ScanReport
 from sl_interfaces.srv import Project
 from sl_interfaces.srv import Scan as ScanService
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from sl_projector.base_node import (
@@ -102,7 +104,9 @@ class ReconstructNode(RigNode):
         self._calibration_fault = "no calibration yet"
         self._last = "no stack yet"
         self._clouds = self.create_publisher(PointCloud2, "reconstruct/points", LARGE)
+        self._reports = self.create_publisher(ScanReport, "reconstruct/report", EVENTS)
         self._rigs = self.create_publisher(RigCalibration, "calibration/rig", LATCHED)
+        self._publish_settings()
         self._frames = (
             self.create_publisher(TFMessage, "/tf_static", LATCHED) if TFMessage else None
         )
@@ -154,6 +158,12 @@ class ReconstructNode(RigNode):
             given = self.declare(item.name, zero if item.default is None else item.default, text)
             values[item.name] = None if item.default is None and not given else given
         return Settings(**values)
+
+    def _publish_settings(self) -> None:
+        """Latch the settings as JSON: a recording then holds what its clouds were made with."""
+        self._settings = self.create_publisher(String, "reconstruct/settings", LATCHED)
+        text = json.dumps(self._workshop.settings.to_dict(), sort_keys=True)
+        self._settings.publish(String(data=text))
 
     def health(self) -> Health:
         """Whether a scan could be made."""
@@ -325,6 +335,7 @@ class ReconstructNode(RigNode):
         report = report_to_msg(product, stack)
         report.processing_s = (done_ns - came_ns) * 1e-9
         report.acquisition_s = max(0.0, (came_ns - stack.stamps_ns[0]) * 1e-9)
+        self._reports.publish(report)
         self.get_logger().info(
             f"scan {stack.scan_id}: {report.points} points {report.processing_s:.3f} s after the "
             f"last image, {computed_s:.3f} s of it reconstruction"
