@@ -40,9 +40,7 @@ def read(camera: CameraDriver, most: int, patience_s: float = 2.0) -> list[Frame
 # -- the camera that Aravis ships -----------------------------------------------------------------
 
 
-def test_two_hundred_software_triggered_frames_without_loss_over_the_wrap_of_their_numbers() -> (
-    None
-):
+def test_software_triggered_frames_without_loss_over_the_wrap_of_their_numbers() -> None:
     """Aravis' fake camera numbers from 65401 on: 65535 is followed by 1 (GigE Vision 2.0)."""
     with fake_gige():
         assert any(SERIAL in line for line in list_cameras())
@@ -51,17 +49,17 @@ def test_two_hundred_software_triggered_frames_without_loss_over_the_wrap_of_the
         camera.configure(SMALL)
         camera.arm()
         ids = []
-        for _ in range(200):
+        for _ in range(140):
             camera.software_trigger()
             (frame,) = read(camera, 1)
             assert frame.status is FrameStatus.OK
             assert frame.image.shape == (48, 64)
             ids.append(frame.frame_id)
-        assert ids == [(65401 + i - 1) % 65535 + 1 for i in range(200)]
+        assert ids == [(65401 + i - 1) % 65535 + 1 for i in range(140)]
         counts = camera.statistics()
-        assert (counts.received, counts.lost, counts.incomplete) == (200, 0, 0)
+        assert (counts.received, counts.lost, counts.incomplete) == (140, 0, 0)
         packets = camera.packets()
-        assert (packets["completed_buffers"], packets["missing_packets"]) == (200, 0)
+        assert (packets["completed_buffers"], packets["missing_packets"]) == (140, 0)
         camera.close()
 
 

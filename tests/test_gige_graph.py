@@ -1,0 +1,121 @@
+"""GigE Vision in the graph: the node on Aravis' fake camera, whole scans on the bench's."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ros_graph
+
+ros_graph.require_ros()
+
+from sensor_msgs.msg import Image  # noqa: E402
+from sl_interfaces.msg import PatternTrigger  # noqa: E402
+
+from camera_bench import fake_gige, gvcp_port, require_gi  # noqa: E402
+from ros_graph import wait  # noqa: E402
+from sl_bench.bench import Bench  # noqa: E402
+from sl_bench.bench_settings import BenchSettings  # noqa: E402
+from sl_bench.reference import reference_rig  # noqa: E402
+from sl_bench.surfaces import flat  # noqa: E402
+from sl_bench.world import World  # noqa: E402
+from sl_camera.aravis_camera import AravisCamera  # noqa: E402
+from sl_camera.camera import CameraSettings  # noqa: E402
+from sl_camera.camera_node import CameraNode  # noqa: E402
+from sl_camera.matching import (  # noqa: E402
+    FrameDecision,
+    ImageEvent,
+    MatcherSettings,
+    StackMatcher,
+    Status,
+    TriggerEvent,
+)
+from sl_projector.base_node import EVENTS, IMAGES  # noqa: E402
+from sl_projector.dlpc900 import Dlpc900  # noqa: E402
+from sl_projector.dmd import Timing  # noqa: E402
+from sl_projector.messages import stamp_from_msg, stamp_to_msg  # noqa: E402
+from sl_projector.sequence import named  # noqa: E402
+
+pytestmark = pytest.mark.xdist_group("gige")
+PAPER = named("paper")
+TIMING = Timing(0.034)
+EXPOSURE_S = 0.033
+
+
+def test_two_hundred_software_triggered_frames_through_the_node_without_loss() -> None:
+    with fake_gige(), ros_graph.graph() as graph:
+        node = graph.add(
+            CameraNode, address="aravis:127.0.0.1", trigger="software", exposure_s=0.003,
+            region=[0, 0, 64, 48], settle_s=0.0,
+        )  # fmt: skip
+        images = graph.collect(Image, "camera/image_raw", IMAGES)
+        wait(lambda: node.health().level == "ok", "the camera")
+        triggers = graph.publisher(PatternTrigger, "projector/trigger", EVENTS)
+        stamps = []
+        for i in range(200):
+            message = PatternTrigger(exposure_s=5.0)
+            stamps.append(time.time_ns())
+            message.header.stamp = stamp_to_msg(stamps[-1])
+            triggers.publish(message)
+            wait(lambda wanted=i + 1: len(images) == wanted, f"image {i}")
+        assert [stamp_from_msg(m.header.stamp) for m in images] == stamps
+        assert {(m.width, m.height, m.encoding) for m in images} == {(64, 48, "mono8")}
+        values = node.health().values
+        assert (values["frames"], values["frames lost"], values["frames incomplete"]) == (200, 0, 0)
+        assert values["times lost"] == 0
+
+
+def run_scan(projector: Dlpc900, camera: AravisCamera, scan_id: int) -> list[FrameDecision]:
+    """Project `paper`, match what comes until there is a verdict."""
+    matcher = StackMatcher(MatcherSettings(require_pose=False))
+    decisions: list[FrameDecision] = []
+    projector.load(PAPER, TIMING)
+    run = projector.run(TIMING)
+    for i, pattern in enumerate(PAPER.patterns):
+        stamp_ns = run.start_ns + round(i * run.timing.period_s * 1e9)
+        event = TriggerEvent(scan_id, "paper", PAPER.dmd_size, i, 11, pattern, stamp_ns, 0.034)
+        decisions += matcher.trigger(event, time.monotonic_ns())
+    while matcher.busy:
+        frame = camera.read(0.005)
+        if frame is not None:
+            height, width = frame.image.shape
+            image = ImageEvent(frame.stamp_ns, height, width, frame.encoding, frame.image.tobytes())
+            decisions += matcher.image(image, time.monotonic_ns())
+        decisions += matcher.tick(time.monotonic_ns())
+    projector.wait()
+    return decisions
+
+
+def test_a_whole_scan_through_gige_vision_and_its_trigger_line(tmp_path: Path) -> None:
+    """Every pixel arrives as the world shows it, with 1 % of the packets lost on the way."""
+    require_gi()
+    settings = BenchSettings(surface="flat", seed=11, camera_gige="127.0.0.1", niceness=0)
+    with gvcp_port(), Bench(settings, tmp_path) as bench:
+        projector, camera = Dlpc900(f"socket:{tmp_path / 'usb.sock'}"), AravisCamera("127.0.0.1")
+        projector.open()
+        camera.open()
+        camera.configure(CameraSettings(exposure_s=EXPOSURE_S))
+        camera.arm()
+        try:
+            bench.execute({"fault": {"camera": {"lose_packets": 0.01}}})
+            stack = run_scan(projector, camera, 1)[-1].stack
+            assert stack is not None
+            world = World(reference_rig(), flat(), settings.make_optics())
+            for i in (0, 10):
+                expected = world.expose([(PAPER.frame(i), EXPOSURE_S)], EXPOSURE_S, i + 1)
+                # Not bit by bit: nanoseconds of the exposure may tip a pixel over.
+                assert np.mean(stack.data[i] != expected) < 1e-4
+            assert camera.packets()["resent_packets"] > 0
+
+            bench.execute({"fault": {"camera": {"at": {"drop": [4]}}}})
+            verdict = run_scan(projector, camera, 2)[-1]
+            assert verdict.status is Status.STACK_REFUSED
+            assert "image 5 of 11 did not come" in verdict.reason
+            bench.execute({"fault": {}})
+            assert run_scan(projector, camera, 3)[-1].status is Status.STACK_COMPLETE
+        finally:
+            camera.close()
+            projector.close()
