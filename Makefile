@@ -22,8 +22,8 @@ export MYPYPATH := $(subst $() ,:,$(foreach p,$(PACKAGES),src/$(p)))
 help: ## this text
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-scan: venv ## install, start the bench and the graph, scan the V-groove, show numbers and pictures
-	@$(BIN)/slrig scan --up --bench --surface groove --measure groove --output $(OUTPUT)/groove
+scan: venv ## install, start bench and graph, calibrate, scan the V-groove, show numbers and pictures
+	@$(BIN)/slrig scan --up --bench --calibrate --surface groove --measure groove --output $(OUTPUT)/groove
 
 test: venv ## install, run all tests
 	@$(PYTEST) -n 2 --dist loadgroup

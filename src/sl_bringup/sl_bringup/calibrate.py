@@ -5,13 +5,15 @@ from __future__ import annotations
 import argparse
 import asyncio
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sl_bringup.graph import Graph, GraphOptions, client_command, client_environment, is_running
 from sl_bringup.progress import complain, say
 from sl_bringup.up import add_graph_arguments, graph_options, until_signal
+from sl_projector.documents import read_document
+from sl_projector.errors import ConfigError
 
 if TYPE_CHECKING:
     from sl_calibration.calibrator import Outcome
@@ -93,6 +95,36 @@ async def calibrate_once(
     for reason in graph.supervisor.unclean:
         complain(f"slrig calibrate: at the end, {reason}")
     return status or int(bool(graph.supervisor.unclean))
+
+
+async def calibrate_bench(graph: Graph, options: GraphOptions) -> int:
+    """Put the hole plate on the bench, calibrate, put the configured part back."""
+    # Imported late: hardware does without it.
+    from sl_bench.bench_control import BenchControl
+    from sl_bench.bench_settings import read_settings
+
+    config = options.directory / "config.yaml"
+    part = read_settings(config)
+
+    def put(surface: str, finish: str, parameters: Mapping[str, Any]) -> None:
+        with BenchControl(options.directory) as bench:
+            bench.put(surface, finish, **parameters)
+
+    say("calibrating: the hole plate is on the stage")
+    await asyncio.to_thread(put, "hole_plate", "matt", _plate_on_bench(config, options))
+    status = await graph.run_client(CLIENT)
+    await asyncio.to_thread(put, part.surface, part.finish, part.surface_parameters)
+    say(f"the {part.surface} is on the stage again")
+    return status
+
+
+def _plate_on_bench(config: Path, options: GraphOptions) -> dict[str, Any]:
+    """Parameters of the bench's hole plate, as the calibration's node believes it to be."""
+    document = read_document(config, ConfigError)
+    section = document.get(f"{options.changes.namespace}/calibration", {})
+    parameters = section.get("ros__parameters", {})
+    names = ("columns", "rows", "pitch_m", "diameter_m", "chamfer_m")
+    return {n: parameters[f"plate_{n}"] for n in names if f"plate_{n}" in parameters}
 
 
 def run(args: argparse.Namespace) -> int:

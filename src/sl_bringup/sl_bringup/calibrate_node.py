@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -16,6 +18,7 @@ from sl_interfaces.action import Calibrate
 from sl_interfaces.srv import Verify
 
 from sl_bringup.calibrate import outcome_lines
+from sl_bringup.paper_tables import table_1_lines
 from sl_bringup.progress import complain, say
 from sl_projector.errors import DeviceLost, DeviceTimeout, SlError
 
@@ -119,6 +122,12 @@ def _calibrate(client: CalibrateClient, args: argparse.Namespace) -> int:
         sys.stderr.write("\n")
     for line in outcome_lines(result):
         say(line)
+    # On this machine the report lies where the node says.
+    file = Path(result.report).with_suffix(".json")
+    if result.report and file.is_file():
+        say("")
+        for line in table_1_lines(json.loads(file.read_text())):
+            say(line)
     return 0 if result.success else 1
 
 

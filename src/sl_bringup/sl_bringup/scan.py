@@ -6,12 +6,15 @@ import argparse
 import asyncio
 import subprocess
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from sl_bringup.calibrate import calibrate_bench
 from sl_bringup.graph import Graph, GraphOptions, client_command, client_environment, is_running
 from sl_bringup.progress import complain, say
 from sl_bringup.up import add_graph_arguments, graph_options, until_signal
+from sl_projector.errors import ConfigError
 
 CLIENT = "sl_bringup.scan_node"
 INTERRUPTED = 130
@@ -27,7 +30,8 @@ def add_parser(subparsers: Any) -> None:
         epilog="examples:\n"
         "  slrig scan --output out\n"
         "  slrig scan --sequence paper --output out\n"
-        "  slrig scan --up --bench --surface groove --measure groove --output out",
+        "  slrig scan --up --bench --surface groove --measure groove --output out\n"
+        "  slrig scan --up --bench --calibrate --output out",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="for the results")
@@ -48,6 +52,10 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--up", action="store_true", help="start the graph for this scan where none is running"
     )
+    parser.add_argument(
+        "--calibrate", action="store_true",
+        help="with --up --bench: begin with a rig that nobody knows, calibrate it on the hole plate",
+    )  # fmt: skip
     parser.add_argument(
         "--ready-timeout", type=float, default=240.0, metavar="S",
         help="with --up: for the graph to get ready (default: 240)",
@@ -72,7 +80,7 @@ def client_arguments(args: argparse.Namespace) -> list[str]:
 async def scan_once(
     options: GraphOptions, client: Sequence[str], ready_timeout_s: float, log: Path, verbose: bool
 ) -> int:
-    """Start a graph, scan, stop the graph; 0 only when all went well."""
+    """Start a graph, calibrate where it is to, scan, stop it; 0 only when all went well."""
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("w") as file:
 
@@ -84,6 +92,8 @@ async def scan_once(
         async def work(graph: Graph) -> int:
             if not await graph.ready(ready_timeout_s):
                 return 1
+            if options.changes.uncalibrated and (status := await calibrate_bench(graph, options)):
+                return status
             return await graph.run_client(CLIENT, *client)
 
         say(f"starting the graph{' on the bench' if options.bench else ''} (log: {log})")
@@ -100,6 +110,13 @@ def run(args: argparse.Namespace) -> int:
     """Carry out ``slrig scan``."""
     options = graph_options(args)
     client = client_arguments(args)
+    if args.calibrate:
+        if not (args.up and args.bench) or is_running(options.directory):
+            raise ConfigError(
+                "--calibrate exchanges the part, which only a bench started for it can; expected "
+                "--up --bench and no running graph (on devices: put the plate on, slrig calibrate)"
+            )
+        options = replace(options, changes=replace(options.changes, uncalibrated=True))
     if args.up and not is_running(options.directory):
         log = args.output / "graph.log"
         return asyncio.run(scan_once(options, client, args.ready_timeout, log, args.verbose))

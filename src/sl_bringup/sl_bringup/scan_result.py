@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sl_bringup.paper_tables import table_2_lines
 from sl_bringup.report import micrometres, write_json, write_page
 from sl_bringup.scan_files import write_scan
 from sl_reconstruct.cloud import CLOUD_DTYPE, Cloud
@@ -68,6 +69,8 @@ def write_result(
     """
     cloud = None if points is None else _cloud(points, report)
     drawn = write_scan(folder, report, cloud, pictures)
+    if points is not None:
+        report["area_m"] = [float(np.nanmax(v) - np.nanmin(v)) for v in (points["x"], points["y"])]
     if points is not None and measure == "groove":
         report["groove"] = _groove(measure_groove(points))
     write_json(folder / "report.json", report)
@@ -144,3 +147,5 @@ def _groove_lines(report: Mapping[str, Any]) -> Iterator[str]:
             f"rms {micrometres(plane['rms_m'])}, {plane['points']:,} points"
         )
     yield f"included angle    {groove['included_angle_deg']:.4f} degrees"
+    yield ""
+    yield from table_2_lines(report)
