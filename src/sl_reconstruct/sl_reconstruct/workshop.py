@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
 import threading
 from collections import OrderedDict
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sl_projector import kernel_cache
 from sl_projector.errors import CalibrationError
 from sl_projector.sequence import Pattern, PatternSequence, named
 from sl_reconstruct.calibration_file import Calibration
@@ -23,6 +24,7 @@ from sl_reconstruct.settings import Settings
 
 #: Sequences whose reconstructor, with its scratch memory, is kept.
 MAX_SEQUENCES = 1
+_MARK = "reconstruct"
 _TINY_CAMERA, _TINY_DMD = (64, 16), (32, 24)
 
 
@@ -110,13 +112,13 @@ def warm_up(rest: bool = False) -> None:
         sequence = named(name, _TINY_DMD)
         stack = np.zeros((len(sequence), *_TINY_CAMERA[::-1]), dtype)
         Reconstructor(tiny_rig(), sequence)(stack)
+    with contextlib.suppress(OSError):
+        kernel_cache.mark(_MARK).touch()
 
 
 def compiled() -> bool:
-    """Tell whether the kernels seem to be in numba's cache: newer there than every source."""
-    package = Path(__file__).parent
-    cached = [file.stat().st_mtime for file in package.glob("__pycache__/*.nbi")]
-    return bool(cached) and max(cached) > max(f.stat().st_mtime for f in package.glob("*.py"))
+    """Tell whether `warm_up` ran before on the sources as they are."""
+    return kernel_cache.mark(_MARK).exists()
 
 
 def compile_apart(rest: bool = False) -> subprocess.Popen[bytes]:
