@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sl_reconstruct.pixels import PixelRow
+from sl_reconstruct.pixels import PixelRow, sample_count
 from sl_reconstruct.reasons import Reason
 
 #: Sub-pixel phases at which the noise gain of the estimator is tabulated.
@@ -24,8 +24,6 @@ PHASES = 16
 MISREAD_PX = 6.0
 #: A narrow shadow under an edge leaves less than this part of the light beside it.
 DIP = 0.6
-#: Secant steps; the third is below 1e-6 px, as the filtered signal is nearly straight.
-SECANTS = 3
 SQRT_2PI = float(np.sqrt(2 * np.pi))
 
 CONTRAST = int(Reason.CONTRAST)
@@ -40,15 +38,13 @@ PRESENT = int(Reason.PRESENT)
 class Filter(NamedTuple):
     """How a signal becomes positions; one row for each source.
 
-    ``taps``: (sources, 1 + radius) half of the symmetric smoothing kernel. ``fit``: (4, points)
-    cubic coefficients of the samples from ``-offset`` on. ``gain``: (sources, PHASES + 1, 2) the
-    sum of squared weights, alone and times the squared profile of a blurred step. ``slope``:
-    (sources,) expected slope of a unit step.
+    ``taps``: (sources, 1 + radius) half of the symmetric smoothing kernel. ``gain``: (sources,
+    PHASES + 1, 2) the sum of squared weights, alone and times the squared profile of a blurred
+    step. ``slope``: (sources,) expected slope of a unit step. The last row of gain and the last
+    slope are those of BR8.
     """
 
     taps: NDArray[np.float32]
-    fit: NDArray[np.float32]
-    offset: int
     gain: NDArray[np.float32]
     slope: NDArray[np.float32]
 
@@ -58,7 +54,7 @@ class Tuning(NamedTuple):
 
     ``direction``: +1 where k grows with u, -1 where it falls. ``reach_px``: beyond it an edge's
     blur does not matter. ``around_px``: a fine stripe's half width. ``scale``: camera pixels per DMD pixel. ``floor_dn``: keeps quotients
-    finite. ``noise_dn2``, ``noise_dn``: variance = noise_dn2 + noise_dn * level.
+    finite. ``least_width``, ``most_width``: of an edge, over what is expected. ``noise_dn2``, ``noise_dn``: variance = noise_dn2 + noise_dn * level.
     ``jump_px``: a centre may lie so far from where the edges on a side lead.
     """
 
@@ -72,8 +68,8 @@ class Tuning(NamedTuple):
     lit_dn: float
     contrast_dn: float
     saturation: int
-    min_slope: float
-    max_slope: float
+    least_width: float
+    most_width: float
     min_light: float
     noise_dn2: float
     noise_dn: float
@@ -84,6 +80,8 @@ class SourceRow(NamedTuple):
     """Scratch for one source in one row: signal, filtered signal, crossings.
 
     ``marks`` has a byte for each pixel, and is seen as ``words``; ``at`` lists the crossings.
+    For each of them: ``fraction`` and ``slope`` of the zero, ``sigma`` and ``width``, ``k`` with
+    ``agreed``, and ``why`` it is refused or 0.
     """
 
     signal: NDArray[np.float32]
@@ -91,6 +89,13 @@ class SourceRow(NamedTuple):
     words: NDArray[np.uint64]
     marks: NDArray[np.uint8]
     at: NDArray[np.int32]
+    fraction: NDArray[np.float32]
+    slope: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    width: NDArray[np.float32]
+    k: NDArray[np.int32]
+    agreed: NDArray[np.uint8]
+    why: NDArray[np.uint8]
 
 
 class Found(NamedTuple):
@@ -106,9 +111,10 @@ class Found(NamedTuple):
 def source_row(width: int) -> SourceRow:
     """Return scratch for rows of ``width`` pixels."""
     words = np.zeros((width + 7) // 8, np.uint64)
+    types = [np.int32, *[np.float32] * 4, np.int32, np.uint8, np.uint8]
     return SourceRow(
-        np.zeros(width, np.float32), np.zeros(width, np.float32),
-        words, words.view(np.uint8), np.zeros(width + 8, np.int32),
+        np.zeros(width, np.float32), np.zeros(width, np.float32), words, words.view(np.uint8),
+        *(np.zeros(width + 8, t) for t in types),
     )  # fmt: skip
 
 
@@ -190,29 +196,26 @@ def find_crossings(lit: Any, r: SourceRow, first: int, last: int) -> int:
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def cubic_zero(filtered: Any, x: int, fit: Any, offset: int) -> tuple[float, float]:
-    """Zero of the fitted cubic between samples x and x + 1, and the slope there.
+@njit(cache=True, nogil=True, error_model="numpy")
+def find_zeros(filtered: Any, at: Any, count: int, fraction: Any, slope: Any) -> None:
+    """Zero of the cubic through four samples about each crossing, and the slope there.
 
-    Secants from the two samples' fitted values; where they do not lead to a zero next to the
-    interval the position is outside [-0.5, 1.5].
+    A secant between the two middle samples, and one Newton step: the filtered signal is nearly
+    straight, and 1e-5 px are left. Where the cubic has no zero there, the fraction leaves [0, 1].
     """
-    c0 = c1 = c2 = c3 = np.float32(0)
-    for j in range(fit.shape[1]):
-        v = filtered[x - offset + j]
-        c0 += fit[0, j] * v
-        c1 += fit[1, j] * v
-        c2 += fit[2, j] * v
-        c3 += fit[3, j] * v
-    one = np.float32(1)
-    fb = c0 + c1 + c2 + c3
-    a, fa, b = np.float32(0), c0, one
-    for _ in range(SECANTS):
-        step = fb - fa
-        t = b - fb * (b - a) / (step if step != 0 else one)
-        a, fa, b = b, fb, t
-        fb = c0 + t * (c1 + t * (c2 + t * c3))
-    return b, c1 + b * (c2 + c2 + np.float32(3) * c3 * b)
+    half, third, sixth = np.float32(1 / 2), np.float32(1 / 3), np.float32(1 / 6)
+    two, three = np.float32(2), np.float32(3)
+    for i in range(count):
+        x = at[i]
+        a, b, c, d = filtered[x - 1], filtered[x], filtered[x + 1], filtered[x + 2]
+        c1 = c - third * a - half * b - sixth * d
+        c2 = half * (a + c) - b
+        c3 = sixth * (d - a) + half * (b - c)
+        t = b / (b - c)
+        value = b + t * (c1 + t * (c2 + t * c3))
+        t -= value / (c1 + t * (two * c2 + t * three * c3))
+        fraction[i] = t
+        slope[i] = abs(c1 + t * (two * c2 + t * three * c3))
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -233,34 +236,44 @@ def light_fails(light: Any, clipped: Any, x: int, t: Tuning) -> int:
     return CONTRAST if min(least, sides) < t.contrast_dn else 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def nearest(middle: float, residue: int, period: int) -> int:
-    """Integer next to ``middle`` that is ``residue`` modulo ``period``."""
-    return residue + period * int(np.floor((middle - residue) * (1.0 / period) + 0.5))
+@njit(cache=True, nogil=True, error_model="numpy")
+def check_light(light: Any, clipped: Any, at: Any, count: int, t: Tuning, why: Any) -> None:
+    """Write for each crossing why the light under it does not do, or 0."""
+    for i in range(count):
+        why[i] = light_fails(light, clipped, np.int64(at[i]), t)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def boundary_of(
-    code: Any, x: int, rising: bool, rising_px: int, half: int, t: Tuning
-) -> tuple[int, bool]:
-    """Boundary k of the edge between x and x + 1, and whether the evidence agrees.
+@njit(cache=True, nogil=True, error_model="numpy")
+def identify(
+    code: Any, r: SourceRow, count: int, rising_px: int, half: int, flip: bool, t: Tuning
+) -> None:
+    """Name the boundary k of each crossing, and whether the evidence agrees.
 
     The edge's pattern and polarity say k modulo 4 D; the Gray code on either side says where.
-    Where they disagree, the pattern's edge next to the code's place is returned. k is 0 where
-    there is none on the DMD.
+    Where they disagree, the pattern's edge next to the code's place is named. k is 0 where there
+    is none on the DMD. ``flip`` exchanges the polarities.
     """
-    a = (code[max(0, x - t.reach_px)] + 0.5) * t.division_px
-    b = (code[min(code.size - 1, x + 1 + t.reach_px)] + 0.5) * t.division_px
-    ahead = (b - a) * t.direction
-    middle = 0.5 * (a + b)
-    turned = 0 if rising == (t.direction > 0) else 2 * half
-    k = nearest(middle, rising_px + turned, 4 * half)
-    span = (2 * t.reach_px + 1) / t.scale
-    near = abs(k - middle) <= max(0.5 * t.division_px + 1.5, min(0.9 * half, MISREAD_PX))
-    agreed = near and -t.division_px <= ahead <= 2.5 * span + t.division_px
-    if not near:
-        k = nearest(middle, rising_px, 2 * half)
-    return (k, agreed) if 0 < k < t.size_px else (0, False)
+    at, ks, agreed, filtered = r.at, r.k, r.agreed, r.filtered
+    period, tolerance = 4.0 * half, max(
+        0.5 * t.division_px + 1.5, min(0.9 * half, MISREAD_PX)
+    )
+    most = 2.5 * (2 * t.reach_px + 1) / t.scale + t.division_px
+    last, turn = code.size - 1, flip != (t.direction < 0)
+    for i in range(count):
+        x = np.int64(at[i])
+        a = np.int64(code[max(0, x - t.reach_px)])
+        b = np.int64(code[min(last, x + 1 + t.reach_px)])
+        ahead = (b - a) * t.direction * t.division_px
+        middle = 0.5 * (a + b + 1) * t.division_px
+        falling = (filtered[x] < 0) == turn
+        first = rising_px + 2.0 * half * falling
+        k = first + period * np.floor((middle - first) * (1.0 / period) + 0.5)
+        near = abs(k - middle) <= tolerance
+        if not near:
+            k = rising_px + 0.5 * period * np.floor((middle - rising_px) * (2.0 / period) + 0.5)
+        inside = (k > 0) & (k < t.size_px)
+        ks[i] = np.int32(k) if inside else np.int32(0)
+        agreed[i] = np.uint8(near & inside & (ahead >= -t.division_px) & (ahead <= most))
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -291,3 +304,41 @@ def single_variance(
 def phase_of(fraction: float) -> int:
     """Row of the gain table for a sub-pixel phase."""
     return min(PHASES, max(0, int(fraction * PHASES + 0.5)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def weigh_pairs(
+    pattern: Any, inverse: Any, light: Any, gain: Any, full_slope: float, t: Tuning,
+    r: SourceRow, count: int,
+) -> None:  # fmt: skip
+    """Write sigma of each crossing of a pair, and how wide it is against what is expected."""
+    at, fraction, slope, sigma, width = r.at, r.fraction, r.slope, r.sigma, r.width
+    for i in range(count):
+        x = at[i]
+        whole = np.float64(pattern[x]) + np.float64(inverse[x]) + t.floor_dn
+        variance = pair_variance(whole, gain, phase_of(fraction[i]), light[x] / whole, t)
+        steep = slope[i] * whole
+        sigma[i] = np.sqrt(variance) / steep
+        width[i] = 2 * light[x] * full_slope / steep
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def weigh_singles(
+    p: PixelRow, gain: Any, full_slope: float, centre: bool, t: Tuning, r: SourceRow, count: int
+) -> None:
+    """Write sigma and width of each crossing of a single image, or of BR8 on it.
+
+    An edge's samples lie about the threshold, those of a centre are all bright or all dark.
+    """
+    at, fraction, slope, sigma, width = r.at, r.fraction, r.slope, r.sigma, r.width
+    threshold, light, bright, dark, filtered = p.threshold, p.light, p.bright, p.dark, r.filtered
+    for i in range(count):
+        x = at[i]
+        level = np.float64(threshold[x])
+        if centre:
+            level += 0.5 * light[x] if filtered[x] < 0 else -0.5 * light[x]
+        b, d = sample_count(bright, x), sample_count(dark, x)
+        variance = single_variance(threshold[x], light[x], b, d, level, t)
+        variance *= gain[phase_of(fraction[i]), 0]
+        sigma[i] = np.sqrt(variance) / (light[x] * slope[i])
+        width[i] = full_slope / slope[i]

@@ -13,8 +13,6 @@ from sl_reconstruct.plan import AxisPlan
 MAX_RADIUS_PX = 12
 #: A kernel wider than this part of a stripe would mix neighbouring edges.
 STRIPE_PART = 0.22
-#: Samples of the paper's cubic fit on either side of the crossing.
-CUBIC_HALF = 2
 
 Array = NDArray[np.float64]
 
@@ -30,11 +28,10 @@ def tap_variance(taps: Array) -> float:
     return float(2 * np.sum(taps[1:] * np.arange(1, taps.size) ** 2))
 
 
-def cubic_fit(points: int) -> tuple[Array, int]:
-    """Least-squares cubic through samples around [0, 1]: (4, points) matrix, and the offset."""
-    offset = points // 2 - 1
-    x = np.arange(points) - offset
-    return np.linalg.pinv(np.vander(x, 4, increasing=True).astype(float)), offset
+def cubic_weights(phase: float) -> Array:
+    """Weights of the samples -1, 0, 1, 2 in the cubic through them, at a phase in [0, 1]."""
+    powers = np.vander([-1.0, 0.0, 1.0, 2.0], 4, increasing=True)
+    return np.asarray(np.linalg.solve(powers.T, phase ** np.arange(4)))
 
 
 def stripe_slope(width_px: float, blur_px: float) -> float:
@@ -51,7 +48,7 @@ def bar_slope(width_px: float, blur_px: float) -> float:
     return float(2 * edge.sum())
 
 
-def noise_gain(taps: Array, fit: Array, offset: int, blur_px: float) -> Array:
+def noise_gain(taps: Array, blur_px: float) -> Array:
     """Sum of squared weights on the raw signal at each sub-pixel phase, shape (PHASES + 1, 2).
 
     The second column weights with the squared profile of a unit blurred step.
@@ -60,20 +57,19 @@ def noise_gain(taps: Array, fit: Array, offset: int, blur_px: float) -> Array:
     radius = taps.size - 1
     out = np.zeros((PHASES + 1, 2))
     for i, phase in enumerate(np.linspace(0, 1, PHASES + 1)):
-        samples = np.array([1, phase, phase**2, phase**3]) @ fit
-        weights = np.convolve(samples, full)
-        x = np.arange(weights.size) - offset - radius - phase
+        weights = np.convolve(cubic_weights(phase), full)
+        x = np.arange(weights.size) - 1 - radius - phase
         profile = erf(x / (np.sqrt(2) * max(blur_px, 1e-3)))
         out[i] = np.sum(weights**2), np.sum(weights**2 * profile**2)
     return out
 
 
-def bar_gain(fit: Array, offset: int) -> Array:
+def bar_gain() -> Array:
     """Like ``noise_gain`` for BR8."""
     kernel = np.array([1.0, 1, 1, 1, 0, -1, -1, -1, -1])
     out = np.zeros((PHASES + 1, 2))
     for i, phase in enumerate(np.linspace(0, 1, PHASES + 1)):
-        weights = np.convolve(np.array([1, phase, phase**2, phase**3]) @ fit, kernel)
+        weights = np.convolve(cubic_weights(phase), kernel)
         out[i] = np.sum(weights**2)
     return out
 
@@ -92,7 +88,6 @@ def edge_filter(plan: AxisPlan, matched: bool, blur_px: float, scale: float) -> 
     scale : float
         Camera pixels per DMD pixel.
     """
-    fit, offset = cubic_fit(4 if matched else 2 * CUBIC_HALF)
     stripes = [2 * s.half_period_px * scale for s in plan.sources]
     kernels = [
         gaussian_taps(sd, min(MAX_RADIUS_PX, int(np.ceil(3 * sd)))) if matched else np.ones(1)
@@ -100,10 +95,11 @@ def edge_filter(plan: AxisPlan, matched: bool, blur_px: float, scale: float) -> 
     ]
     radius = max(k.size for k in kernels)
     padded = np.array([np.pad(k, (0, radius - k.size)) for k in kernels])
-    gain = [noise_gain(k, fit, offset, blur_px) for k in kernels] + [bar_gain(fit, offset)]
+    gain = [noise_gain(k, blur_px) for k in kernels] + [bar_gain()]
     total = [float(np.sqrt(blur_px**2 + tap_variance(k))) for k in kernels]
     slope = [stripe_slope(w, s) for w, s in zip(stripes, total, strict=True)]
+    slope.append(bar_slope(min(stripes), blur_px))
     return Filter(
-        padded.astype(np.float32), fit.astype(np.float32), offset,
+        padded.astype(np.float32),
         np.array(gain, np.float32), np.array(slope, np.float32),
     )  # fmt: skip

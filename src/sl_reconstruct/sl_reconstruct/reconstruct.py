@@ -14,8 +14,8 @@ from sl_projector.errors import StackError
 from sl_projector.sequence import PatternSequence
 from sl_reconstruct.cloud import CLOUD_DTYPE, Cloud, Figures, count_reasons
 from sl_reconstruct.crossed import Crossed, cross_rows, map_rows
-from sl_reconstruct.edges import SQRT_2PI, Filter, Tuning
-from sl_reconstruct.filters import bar_slope, edge_filter, gaussian_taps, tap_variance
+from sl_reconstruct.edges import Filter, Tuning
+from sl_reconstruct.filters import edge_filter, gaussian_taps, tap_variance
 from sl_reconstruct.geometry import geometry, ray_row
 from sl_reconstruct.plan import AxisPlan, DecodePlan
 from sl_reconstruct.points import Output, Screen, triangulate_rows
@@ -43,7 +43,7 @@ class AxisState(NamedTuple):
 
     tuning: Tuning
     edge_filter: Filter
-    bar_slope: float
+    bars: bool
     blur_px: float
     noise: Noise
 
@@ -166,7 +166,7 @@ class Reconstructor:
         state = survey(stack, ys, plan, layout, self.settings, few)
         lines = self._lines((stack.shape[1], plan, "all"))
         rows = np.arange(stack.shape[1])
-        arguments = (stack, layout, state.edge_filter, state.tuning, state.bar_slope, lines)
+        arguments = (stack, layout, state.edge_filter, state.tuning, state.bars, lines)
 
         def work(first: int, last: int) -> None:
             scratch = row_scratch(stack.shape[2], stack.dtype, -(-plan.size_px // plan.division_px))
@@ -266,21 +266,19 @@ def survey(
         noise_dn2=noise.read_dn2, noise_dn=noise.shot_dn,
     )  # fmt: skip
     first = edge_filter(plan, True, FIRST_BLUR_PX, tuning.scale)
-    decode_rows(ys, 0, ys.size, stack, layout, first, tuning, 0.0, few, scratch)
+    decode_rows(ys, 0, ys.size, stack, layout, first, tuning, False, few, scratch)
     scale = measure_scale(few, tuning.scale)
     stripe_px = min(s.half_period_px for s in plan.sources) * scale
     tuning = tuning._replace(scale=scale, around_px=max(3, int(np.ceil(stripe_px)) + 3))
     blur_px = settings.edge_blur_px or measure_blur(few, plan, layout, tuning.scale)
     tuning = tuning._replace(
         reach_px=max(2, int(np.ceil(REACH_SD * blur_px))),
-        min_slope=settings.min_slope, max_slope=settings.max_slope,
+        least_width=1 / settings.max_slope, most_width=1 / max(settings.min_slope, 1e-9),
     )  # fmt: skip
     matched = settings.estimator == "matched"
-    bars = 0.0 if matched else bar_slope(2 * plan.sources[0].half_period_px * tuning.scale, blur_px)
-    return AxisState(
-        tuning, edge_filter(plan, matched, blur_px, tuning.scale),
-        bars if bars > MIN_BAR_SLOPE else 0.0, blur_px, noise,
-    )  # fmt: skip
+    filters = edge_filter(plan, matched, blur_px, tuning.scale)
+    bars = not matched and bool(filters.slope[-1] > MIN_BAR_SLOPE)
+    return AxisState(tuning, filters, bars, blur_px, noise)
 
 
 def measure_scale(lines: Lines, guess: float) -> float:

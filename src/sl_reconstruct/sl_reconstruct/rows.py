@@ -9,11 +9,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sl_reconstruct.edges import (
-    CONTRAST,
     IDENTITY,
     PRESENT,
     SATURATION,
-    SHADOW,
     SHAPE,
     UNLIT,
     Filter,
@@ -21,22 +19,20 @@ from sl_reconstruct.edges import (
     SourceRow,
     Tuning,
     bar_centres,
-    boundary_of,
-    cubic_zero,
+    check_light,
     find_crossings,
-    light_fails,
+    find_zeros,
+    identify,
     pair_signal,
-    pair_variance,
-    phase_of,
     single_signal,
-    single_variance,
     smooth,
     source_row,
+    weigh_pairs,
+    weigh_singles,
 )
 from sl_reconstruct.pixels import (
     PixelRow,
     pixel_row,
-    sample_count,
     set_code,
     set_levels,
     set_masks,
@@ -44,6 +40,9 @@ from sl_reconstruct.pixels import (
     set_threshold,
 )
 from sl_reconstruct.reasons import Reason
+
+#: BR8's slope depends on the stripe's width and blur more than an edge's does.
+BAR_LATITUDE = 3.0
 
 ORDER = int(Reason.ORDER)
 STEP = int(Reason.STEP)
@@ -119,103 +118,73 @@ def _refuse(reason: Any, k: int, why: int) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _edges(
-    s: int, pattern: Any, inverse: Any, plan: Layout, f: Filter, t: Tuning, p: PixelRow,
-    r: SourceRow, out: Found, tally: Any, average: bool,
-) -> None:  # fmt: skip
-    """Find and identify the edges of one source; with ``average``, centres between them."""
-    # fields are taken out of their tuples here: in the loop that would count references
-    half, rising_px, paired = plan.sources[s, 2], plan.sources[s, 3], plan.sources[s, 1] >= 0
-    edge_owner, centre_owner = plan.edge_owner, plan.centre_owner
-    gain, full_slope, fit, offset = f.gain[s], f.slope[s], f.fit, f.offset
-    code, light, clipped, threshold = p.code, p.light, p.clipped, p.threshold
-    bright, dark, filtered, at = p.bright, p.dark, r.filtered, r.at
+def _settle(
+    owner: Any, s: int, r: SourceRow, count: int, least: float, most: float, out: Found, tally: Any
+) -> None:
+    """Accept or refuse each crossing of one source, and write it where it belongs."""
+    at, fraction, width, sigma = r.at, r.fraction, r.width, r.sigma
+    ks, agreed, why = r.k, r.agreed, r.why
     u_px, sigma_px, width_px, reasons = out.u_px, out.sigma_px, out.width_px, out.reason
-    last_k, last_u, last_sigma = 0, 0.0, 0.0
     accepted = confused = 0
-    count = find_crossings(p.lit, r, offset, filtered.size - fit.shape[1] + offset + 1)
     for i in range(count):
-        x = np.int64(at[i])
-        k, agreed = boundary_of(code, x, filtered[x] < 0, rising_px, half, t)
-        reason = light_fails(light, clipped, x, t)
-        fraction, slope = cubic_zero(filtered, x, fit, offset)
-        phase = phase_of(fraction)
-        if paired:
-            whole = np.float64(pattern[x]) + np.float64(inverse[x]) + t.floor_dn
-            variance = pair_variance(whole, gain, phase, light[x] / whole, t)
-            full = 2 * light[x] * full_slope
-        else:
-            whole = np.float64(light[x])
-            middle, b, d = threshold[x], sample_count(bright, x), sample_count(dark, x)
-            variance = gain[phase, 0] * single_variance(middle, whole, b, d, middle, t)
-            full = whole * full_slope
-        steep = abs(slope) * whole
-        good = t.min_slope * full <= steep <= t.max_slope * full and -0.5 <= fraction <= 1.5
-        if reason == 0 and not good:
+        k, reason = np.int64(ks[i]), np.int64(why[i])
+        shaped = (
+            (width[i] >= least) & (width[i] <= most) & (fraction[i] >= -0.5) & (fraction[i] <= 1.5)
+        )
+        if reason == 0 and not shaped:
             reason = SHAPE
-        if reason == 0 and not agreed:
+        if reason == 0 and not agreed[i]:
             reason = IDENTITY
             confused += 1
-        if reason != 0:
-            if k > 0 and edge_owner[k] == s:
-                _refuse(reasons, k, reason)
-            last_k = 0
+        accepted += reason == 0
+        if k == 0 or owner[k] != s:
             continue
-        accepted += 1
-        u, sigma, width = x + fraction, np.sqrt(variance) / steep, full / steep
-        if edge_owner[k] == s:
-            _write(u_px, sigma_px, width_px, reasons, k, u, sigma, width)
-        if average and abs(k - last_k) == 2 * half and last_k > 0:
-            centre = (k + last_k) // 2
-            if centre_owner[centre] == s:
-                spread = 0.5 * np.sqrt(sigma * sigma + last_sigma * last_sigma)
-                _write(
-                    u_px, sigma_px, width_px, reasons, centre, 0.5 * (u + last_u), spread, width
-                )
-        last_k, last_u, last_sigma = k, u, sigma
-    tally[0] = accepted
-    tally[1] = confused
+        if reason == 0:
+            _write(u_px, sigma_px, width_px, reasons, k, at[i] + fraction[i], sigma[i], width[i])
+        else:
+            _refuse(reasons, k, reason)
+    tally[0] += accepted
+    tally[1] += confused
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _edges(
+    s: int, pattern: Any, inverse: Any, plan: Layout, f: Filter, t: Tuning, p: PixelRow,
+    r: SourceRow, out: Found, tally: Any,
+) -> None:  # fmt: skip
+    """Find and identify the edges of one source."""
+    count = find_crossings(p.lit, r, 1, r.filtered.size - 2)
+    find_zeros(r.filtered, r.at, count, r.fraction, r.slope)
+    identify(p.code, r, count, plan.sources[s, 3], plan.sources[s, 2], False, t)
+    check_light(p.light, p.clipped, r.at, count, t, r.why)
+    if plan.sources[s, 1] >= 0:
+        weigh_pairs(pattern, inverse, p.light, f.gain[s], f.slope[s], t, r, count)
+    else:
+        weigh_singles(p, f.gain[s], f.slope[s], False, t, r, count)
+    _settle(plan.edge_owner, s, r, count, t.least_width, t.most_width, out, tally)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _bars(
-    s: int, plan: Layout, f: Filter, t: Tuning, p: PixelRow, r: SourceRow, out: Found,
-    expected: float,
-) -> None:  # fmt: skip
+    s: int, plan: Layout, f: Filter, t: Tuning, p: PixelRow, r: SourceRow, out: Found, tally: Any
+) -> None:
     """Find and identify the centres of one source by BR8's zero crossings, Eq. (6)."""
-    half, rising_px, centre_owner = plan.sources[s, 2], plan.sources[s, 3], plan.centre_owner
-    gain, fit, offset = f.gain[f.gain.shape[0] - 1], f.fit, f.offset
-    code, light, clipped, threshold = p.code, p.light, p.clipped, p.threshold
-    bright, dark, filtered, at = p.bright, p.dark, r.filtered, r.at
-    u_px, sigma_px, width_px, reasons = out.u_px, out.sigma_px, out.width_px, out.reason
-    last = filtered.size - fit.shape[1] + offset - 4
-    for i in range(find_crossings(p.lit, r, offset + 4, last)):
-        x = np.int64(at[i])
-        lit = filtered[x] < 0  # left of a bright centre the left samples are darker
-        k, agreed = boundary_of(code, x, lit == (t.direction > 0), rising_px + half, half, t)
-        if k == 0 or centre_owner[k] != s:
-            continue
-        fraction, slope = cubic_zero(filtered, x, fit, offset)
-        ratio = abs(slope) / expected
-        reason = light_fails(light, clipped, x, t)
-        if reason == 0 and not t.min_slope <= ratio <= 2 * t.max_slope:
-            reason = SHAPE
-        if reason == 0 and not agreed:
-            reason = IDENTITY
-        if reason != 0:
-            _refuse(reasons, k, reason)
-            continue
-        level = threshold[x] + (0.5 if lit else -0.5) * light[x]
-        b, d = sample_count(bright, x), sample_count(dark, x)
-        variance = single_variance(threshold[x], light[x], b, d, level, t)
-        sigma = np.sqrt(gain[phase_of(fraction), 0] * variance) / (light[x] * abs(slope))
-        _write(u_px, sigma_px, width_px, reasons, k, x + fraction, sigma, 1.0)
+    count = find_crossings(p.lit, r, 5, r.filtered.size - 6)
+    find_zeros(r.filtered, r.at, count, r.fraction, r.slope)
+    half = plan.sources[s, 2]
+    # left of a bright centre the left samples are the darker ones, whichever way k grows
+    identify(p.code, r, count, plan.sources[s, 3] + half, half, t.direction < 0, t)
+    check_light(p.light, p.clipped, r.at, count, t, r.why)
+    last = f.slope.size - 1
+    weigh_singles(p, f.gain[last], f.slope[last], True, t, r, count)
+    least, most = t.least_width / BAR_LATITUDE, BAR_LATITUDE * t.most_width
+    _settle(plan.centre_owner, s, r, count, least, most, out, tally)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _source(
     stack: Any, y: int, s: int, plan: Layout, f: Filter, t: Tuning, p: PixelRow, r: SourceRow,
-    out: Found, tally: Any, bar_slope: float,
+    out: Found, tally: Any, bars: bool,
 ) -> None:  # fmt: skip
     """Everything that one source gives in one row."""
     pattern = stack[plan.sources[s, 0], y]
@@ -225,11 +194,31 @@ def _source(
     else:
         single_signal(pattern, p, t.floor_dn, r.signal)
     smooth(r.signal, f.taps[s], r.filtered)
-    centres = plan.sources[s, 5] != 0
-    _edges(s, pattern, inverse, plan, f, t, p, r, out, tally, centres and bar_slope <= 0)
-    if centres and bar_slope > 0:
+    tally[0] = 0
+    tally[1] = 0
+    _edges(s, pattern, inverse, plan, f, t, p, r, out, tally)
+    if bars and plan.sources[s, 5]:
         bar_centres(r.signal, r.filtered)
-        _bars(s, plan, f, t, p, r, out, bar_slope)
+        _bars(s, plan, f, t, p, r, out, tally)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _average_centres(plan: Layout, out: Found) -> None:
+    """The centre of a stripe lies midway between its two edges, which one image shows."""
+    owner, edge_owner, sources = plan.centre_owner, plan.edge_owner, plan.sources
+    u_px, sigma_px, width_px, reason = out.u_px, out.sigma_px, out.width_px, out.reason
+    for k in range(owner.size):
+        if owner[k] < 0:
+            continue
+        half = sources[owner[k], 2]
+        a, b = k - half, k + half
+        if reason[a] == PRESENT and reason[b] == PRESENT and edge_owner[a] == edge_owner[b]:
+            u_px[k] = np.float32(0.5) * (u_px[a] + u_px[b])
+            sigma_px[k] = np.float32(0.5) * np.sqrt(sigma_px[a] ** 2 + sigma_px[b] ** 2)
+            width_px[k] = width_px[a]
+            reason[k] = PRESENT
+        elif reason[a] > UNLIT or reason[b] > UNLIT:
+            reason[k] = max(reason[a], reason[b])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -325,7 +314,7 @@ def _account(plan: Layout, seen: Any, blind: Any, division_px: int, reason: Any)
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _row(
-    stack: Any, y: int, i: int, plan: Layout, f: Filter, t: Tuning, bar_slope: float,
+    stack: Any, y: int, i: int, plan: Layout, f: Filter, t: Tuning, bars: bool,
     scratch: RowScratch, lines: Lines,
 ) -> None:  # fmt: skip
     p, r, seen, blind = scratch.pixels, scratch.source, scratch.seen, scratch.blind
@@ -336,8 +325,10 @@ def _row(
     found.reason[:] = UNLIT
     decode_pixels(stack, y, plan, t, p)
     for s in range(plan.sources.shape[0]):
-        _source(stack, y, s, plan, f, t, p, r, found, lines.tally[i, s], bar_slope)
+        _source(stack, y, s, plan, f, t, p, r, found, lines.tally[i, s], bars)
     if plan.centres:
+        if not bars:
+            _average_centres(plan, found)
         _check_centres(plan, t, found)
     _levels(p, plan.dynamic, found)
     _see(p, seen, blind)
@@ -364,8 +355,8 @@ def row_scratch(width: int, dtype: Any, divisions: int) -> RowScratch:
 @njit(cache=True, nogil=True, error_model="numpy")
 def decode_rows(
     ys: Any, first: int, last: int, stack: Any, plan: Layout, f: Filter, t: Tuning,
-    bar_slope: float, lines: Lines, scratch: RowScratch,
+    bars: bool, lines: Lines, scratch: RowScratch,
 ) -> None:  # fmt: skip
     """Decode the stack's rows ``ys[first:last]`` into the lines of the same numbers."""
     for i in range(first, last):
-        _row(stack, ys[i], i, plan, f, t, bar_slope, scratch, lines)
+        _row(stack, ys[i], i, plan, f, t, bars, scratch, lines)
