@@ -187,6 +187,16 @@ def test_part_of_the_plate_is_numbered_by_its_mark_or_its_sides():
     assert np.abs(view.centres_px - through(h, view.plate_xy_m)).max() < DRAWN_PX
 
 
+def test_rows_out_of_the_light_are_not_numbered():
+    plate = replace(PLATE, rows=6, columns=6)
+    h = pinhole(5.0, 0.0, centre_px=(200.0, 130.0))
+    image = drawn(plate, h)
+    image[:53] = 6  # row 5, at v = 25, and more than half of the way to row 4; below row 0 is light
+    view = find_plate(image, plate)
+    assert view.ids[:, 1].max() == 4 and len(view.ids) == 30
+    assert np.abs(view.centres_px - through(h, view.plate_xy_m)).max() < DRAWN_PX
+
+
 def test_a_plate_whose_mark_is_out_of_view_is_not_guessed():
     plate = replace(PLATE, columns=6, rows=6, origin_diameter_m=0.75e-3)
     # the lower and the upper corner are cut by the image's border: either might be the mark

@@ -84,7 +84,7 @@ def find_plate(
     enough = int(0.9 * plate.hole_count)
     lattice = find_lattice(blobs, *_ratios(plate), enough)
     _check_enough(plate, len(lattice), len(blobs.centres_px))
-    ids, start = _identified(plate, blobs, lattice, (grey.shape[1], grey.shape[0]))
+    ids, start = _identified(plate, blobs, lattice, grey)
     ids, fits = _measured(grey, plate, ids, start, full)
     return _view(plate, ids, fits, (grey.shape[1], grey.shape[0]))
 
@@ -121,16 +121,14 @@ def _check_enough(plate: Plate, holes: int, spots: int) -> None:
         )
 
 
-def _identified(
-    plate: Plate, blobs: Blobs, lattice: Lattice, size: tuple[int, int]
-) -> tuple[Ids, Blobs]:
+def _identified(plate: Plate, blobs: Blobs, lattice: Lattice, grey: Image) -> tuple[Ids, Blobs]:
     """Number the holes: (column, row) and spots, in the same order."""
     ij, spots = np.array(list(lattice)), np.array(list(lattice.values()))
     found = Blobs(blobs.centres_px[spots], blobs.shapes_px2[spots])
     h, _ = cv2.findHomography(ij.astype(np.float64), found.centres_px, cv2.LMEDS)
     margin = 1.2 * float(np.median(found.sizes_px)) * _ratios(plate)[1] + 2.0
     marks = _marks(plate, found, ij, np.asarray(h))
-    return place(plate, FoundLattice(ij, marks, np.asarray(h), size, margin)).ids(ij), found
+    return place(plate, FoundLattice(ij, marks, np.asarray(h), grey, margin)).ids(ij), found
 
 
 def _marks(plate: Plate, found: Blobs, ij: Ids, lattice_to_image: Array) -> NDArray[np.bool_]:

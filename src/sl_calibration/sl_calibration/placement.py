@@ -1,7 +1,7 @@
 """Which hole of the plate is which: rotation, offset and side of a found lattice.
 
 Every way to lay the plate's holes on the found lattice is scored by what it leaves unexplained:
-holes that should be in view but are not there, and a mark where there should be none.
+holes that should lie in lit plate in view but are not there, and a mark where there should be none.
 """
 
 from __future__ import annotations
@@ -20,12 +20,15 @@ Ids = NDArray[np.int64]
 
 #: A mark missing where it should be, or found where none should be, weighs as many lost holes.
 MARK_WEIGHT = 4
+#: A place is lit where its surroundings have this share of the found holes'.
+MIN_LIT = 0.3
 #: Turning the plate over must explain this many holes more than leaving it.
 SIDE_MARGIN = 2
 
 _ROTATIONS = [
     np.array([[c, -s], [s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))
 ]  # fmt: skip
+_DIAGONALS = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, 0.5], [-0.5, -0.5]])
 _MIRROR = np.diag([1, -1])
 
 
@@ -55,8 +58,8 @@ class FoundLattice:
         Those of the size of the origin mark.
     lattice_to_image : ndarray, (3, 3)
         Homography from (i, j) to pixels.
-    image_size : tuple of int
-        (width, height).
+    image : ndarray, (H, W) float32
+        Dark holes on a bright plate.
     margin_px : float
         A hole centred nearer than this to the image's border may be cut.
     """
@@ -64,7 +67,7 @@ class FoundLattice:
     ij: Ids
     marks: NDArray[np.bool_]
     lattice_to_image: Array
-    image_size: tuple[int, int]
+    image: NDArray[np.float32]
     margin_px: float
 
     def pixels(self, ij: Array | Ids) -> Array:
@@ -72,12 +75,26 @@ class FoundLattice:
         local = ij @ self.lattice_to_image[:, :2].T + self.lattice_to_image[:, 2]
         return np.asarray(local[..., :2] / local[..., 2:])
 
-    def in_view(self, ij: Array | Ids) -> NDArray[np.bool_]:
-        """Whether holes at lattice points (N, 2) lie wholly in the image."""
+    def in_view(self, ij: Ids) -> NDArray[np.bool_]:
+        """Whether holes at lattice points (N, 2) lie wholly in the image, in lit plate."""
         local = ij @ self.lattice_to_image[:, :2].T + self.lattice_to_image[:, 2]
-        q, last = self.pixels(ij), np.array(self.image_size) - 1 - self.margin_px
+        last = np.array(self.image.shape[::-1]) - 1 - self.margin_px
+        q = self.pixels(ij)
         inside = np.all((q > self.margin_px) & (q < last), axis=-1)
-        return np.asarray(inside & (local[..., 2] * self.lattice_to_image[2, 2] > 0))
+        inside &= local[..., 2] * self.lattice_to_image[2, 2] > 0
+        return np.asarray(
+            inside & (self._surround(ij) > MIN_LIT * np.median(self._surround(self.ij)))
+        )
+
+    def _surround(self, ij: Ids) -> Array:
+        """Lowest level (N,) half-way to the four diagonal neighbours; inf where none is in view."""
+        lowest = np.full(len(ij), np.inf)
+        for step in _DIAGONALS:
+            q = np.rint(self.pixels(ij + step))
+            seen = np.all((q >= 0) & (q < self.image.shape[::-1]), axis=1)
+            u, v = np.where(seen[:, None], q, 0).astype(int).T
+            lowest = np.minimum(lowest, np.where(seen, self.image[v, u], np.inf))
+        return lowest
 
 
 def place(plate: Plate, found: FoundLattice) -> Placement:

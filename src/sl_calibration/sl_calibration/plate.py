@@ -130,7 +130,7 @@ class PlateView:
     flags : ndarray, (N,) uint8
         `HoleFlag` bits.
     missing : ndarray, (M, 2) int
-        Holes that should be in view but were not found.
+        Holes that should be in view but were not found: blocked, or out of the light.
     bias_px : ndarray, (N, 2)
         Centre of the fitted ellipse minus ``centres_px``: what was corrected.
     axes_px : ndarray, (N, 2)
