@@ -24,7 +24,8 @@ import pytest
 from sl_bench.camera_emulator import CameraEmulator, Execute, Exposure
 from sl_bench.gige_camera import GigeCamera
 from sl_bringup.bag_writer import new_bag
-from sl_camera.aravis_camera import AravisCamera, load_aravis
+from sl_camera.aravis_camera import AravisCamera
+from sl_camera.aravis_library import load_aravis
 from sl_camera.camera import CameraDriver
 from sl_camera.camera_drivers import make_camera
 from sl_camera.replay_camera import ReplayCamera

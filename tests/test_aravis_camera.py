@@ -17,7 +17,8 @@ from camera_bench import HEIGHT, SERIAL, WIDTH, fake_gige, gige_bench, require_g
 from sl_bench.camera_emulator import CameraEmulator
 from sl_bench.camera_faults import CameraFaults
 from sl_bench.gige_camera import GigeCamera
-from sl_camera.aravis_camera import AravisCamera, AravisOptions, list_cameras
+from sl_camera.aravis_camera import AravisCamera, AravisOptions
+from sl_camera.aravis_library import list_cameras
 from sl_camera.camera import CameraDriver, CameraSettings, Frame, FrameStatus
 from sl_projector.errors import DeviceError, DeviceLost, DeviceRefused
 

@@ -34,7 +34,7 @@ BENCH_MAY_SEE = {"rig", "calibration_file", "plausible"}
 DEVICE_SDKS = {"usb", "serial", "hid", "termios", "gi", "pypylon"}
 SDK_FILES = {
     "sl_projector/transport.py", "sl_projector/usb_socket.py", "sl_camera/grbl.py",
-    "sl_camera/serial_lines.py", "sl_camera/aravis_camera.py", "sl_bench/usb_server.py",
+    "sl_camera/serial_lines.py", "sl_camera/aravis_library.py", "sl_bench/usb_server.py",
     "sl_bench/pty_port.py", "sl_bringup/doctor.py", "sl_bringup/doctor_checks.py",
 }  # fmt: skip
 ROS_MODULES = re.compile(

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import yaml
 
 from sl_bringup import doctor, doctor_checks
 from sl_bringup.cli import main
 from sl_bringup.doctor_checks import Finding
 from sl_bringup.graph import GraphOptions
+from sl_bringup.graph_config import Changes, write_config
 from sl_bringup.transport import MIB
 
 
@@ -70,3 +72,29 @@ def test_a_check_that_fails_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(doctor_checks, "python", fail)
     findings = doctor.examine(GraphOptions(bench=True))
     assert "broken" in next(f.text for f in findings if f.level == "bad")
+
+
+@pytest.mark.parametrize(
+    ("address", "text"),
+    [
+        ("uvc:/dev/no_such_video", "no /dev/no_such_video"),
+        ("bag:/no/such/bag", "nothing at /no/such/bag"),
+        ("firewire:1", "expected aravis:SERIAL"),
+    ],
+)
+def test_cameras_that_are_not_there(tmp_path: Path, address: str, text: str) -> None:
+    config = tmp_path / "rig.yaml"
+    config.write_text(f"/sl/camera: {{ros__parameters: {{address: '{address}'}}}}")
+    finding = doctor_checks.camera(config, bench=False)[0]
+    assert finding.level == "bad"
+    assert text in finding.text
+    assert finding.remedy
+
+
+def test_the_reconstruction_is_told_where_twelve_bits_end(tmp_path: Path) -> None:
+    config = tmp_path / "rig.yaml"
+    for pixel_format, expected in (("mono12p", 4095), ("mono10", 1023), ("mono16", None)):
+        config.write_text(f"/sl/camera: {{ros__parameters: {{pixel_format: {pixel_format}}}}}")
+        made = yaml.safe_load(write_config(config, tmp_path, Changes()).read_text())
+        reconstruct = made.get("/sl/reconstruct", {}).get("ros__parameters", {})
+        assert reconstruct.get("saturation_dn") == expected

@@ -549,6 +549,50 @@ def test_a_software_triggered_camera_follows_the_projector() -> None:
         assert (driver.triggered, len(images)) == (3, 1)
 
 
+def test_another_makers_driver_serves_by_remapping_its_image() -> None:
+    """A node of its own namespace and frame, best it can: stamps 3 ms late, rows padded."""
+    from rclpy.node import Node
+
+    with ros_graph.graph() as graph:
+        graph.add(SynchronizerNode, timeout_s=0.4, require_pose=False)
+        driver = Node(
+            "pylon", namespace="maker", context=graph.context,
+            cli_args=["--ros-args", "-r", "~/image_raw:=/sl/camera/image_raw"],
+        )  # fmt: skip
+        publisher = driver.create_publisher(Image, "~/image_raw", 30)
+        assert publisher.topic_name == "/sl/camera/image_raw"
+        stacks = graph.collect(PatternStack, "synchronizer/stack", LARGE)
+        verdicts = graph.collect(MatchedFrame, "synchronizer/frame", EVENTS)
+        triggers = graph.publisher(PatternTrigger, "projector/trigger", EVENTS)
+        wait(publisher.get_subscription_count, "the synchroniser")
+        pixels = np.random.default_rng(8).integers(0, 256, (len(SEQUENCE), 6, 7), np.uint8)
+
+        def scan(scan_id: int, images: list[int]) -> None:
+            start_ns = time.time_ns()
+            for i in range(len(SEQUENCE)):
+                stamp_ns = start_ns + i * PERIOD_NS
+                triggers.publish(
+                    trigger_to_msg(SEQUENCE, i, scan_id, stamp_ns, 0.019, "sl_projector_optical")
+                )
+            for i in images:
+                padded = np.zeros((6, 10), np.uint8)
+                padded[:, :7] = pixels[i]
+                message = Image(height=6, width=7, step=10, encoding="mono8")
+                message.data = padded.ravel().tobytes()
+                message.header.stamp = stamp_to_msg(start_ns + i * PERIOD_NS + 3_000_000)
+                message.header.frame_id = "pylon_camera"
+                publisher.publish(message)
+
+        scan(1, list(range(len(SEQUENCE))))
+        stack = wait(lambda: stacks and stacks[0], "the stack")
+        assert bytes(stack.data) == pixels.tobytes()
+        scan(2, [0, 1, *range(3, len(SEQUENCE))])
+        refused = (2, MatchedFrame.STACK_REFUSED)
+        wait(lambda: [f for f in verdicts if (f.scan_id, f.status) == refused], "a refusal")
+        assert len(stacks) == 1
+        driver.destroy_node()
+
+
 # -- stage ----------------------------------------------------------------------------------------
 
 

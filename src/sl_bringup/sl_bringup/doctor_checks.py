@@ -23,7 +23,10 @@ from sl_bringup.transport import (
     SMALL_SEGMENT_BYTES,
     free_bytes,
 )
-from sl_projector.errors import SlError
+from sl_camera.aravis_library import INSTALL as ARAVIS_INSTALL
+from sl_camera.aravis_library import find_camera, list_cameras, load_aravis
+from sl_camera.camera_drivers import make_camera
+from sl_projector.errors import DeviceLost, SlError
 
 PYTHON_RANGE = ((3, 11), (3, 13))
 #: Module and the name under which pip knows it.
@@ -228,18 +231,54 @@ def serial_ports(source: Path, bench: bool) -> list[Finding]:
 
 
 def camera(source: Path, bench: bool) -> list[Finding]:
-    """The camera's address; Aravis is optional."""
+    """The camera that the configuration names, and those that answer."""
     if bench:
         return []
     address = _parameter(source, "camera", "address")
-    found: list[Finding] = []
-    if address.startswith("/") and not Path(address).is_socket():
+    if not address:
+        remedy = "put its address into the configuration (docs/cameras.md)"
+        return [Finding("note", "camera", "no address in the configuration", remedy), _aravis()]
+    try:
+        make_camera(address)
+    except SlError as error:
+        return [Finding("bad", "camera", str(error), "correct the configuration")]
+    kind, _, place = address.rpartition(":")
+    if kind == "aravis":
+        return [_genicam(place)]
+    if kind == "uvc":
+        return [_video(place), _aravis()]
+    if not Path(place).exists():
         remedy = "start the process that serves the camera, or correct the configuration"
-        found.append(Finding("bad", "camera", f"nothing serves {address}", remedy))
-    else:
-        found.append(Finding("ok", "camera", address or "no address in the configuration"))
+        return [Finding("bad", "camera", f"nothing at {place}", remedy), _aravis()]
+    return [Finding("ok", "camera", address), _aravis()]
+
+
+def _aravis() -> Finding:
     text = "there" if _there("gi") else "not installed; only cameras over GenICam need it"
-    return [*found, Finding("note", "Aravis", text)]
+    return Finding("note", "Aravis", text)
+
+
+def _genicam(name: str) -> Finding:
+    try:
+        found = find_camera(load_aravis(), name)
+        others = ", ".join(list_cameras())
+    except DeviceLost as error:
+        return Finding("bad", "camera", str(error), "arv-tool-0.8   (package aravis-tools-cli)")
+    except SlError as error:
+        return Finding("bad", "camera", str(error), ARAVIS_INSTALL)
+    return Finding("ok", "camera", f"{found} (answering: {others or 'none'})")
+
+
+def _video(device: str) -> Finding:
+    path = Path(f"/dev/video{device}") if device.isdigit() else Path(device)
+    if not path.exists():
+        there = ", ".join(map(str, sorted(Path("/dev").glob("video*")))) or "none"
+        remedy = "plug it in, or name another (v4l2-ctl --list-devices)"
+        return Finding("bad", "camera", f"no {path}; there are: {there}", remedy)
+    if not os.access(path, os.R_OK | os.W_OK):
+        remedy = "sudo usermod -aG video $USER, then log in again"
+        return Finding("bad", "camera", f"no permission for {path}", remedy)
+    return Finding("ok", "camera", str(path))
 
 
 def graph(options: GraphOptions) -> list[Finding]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from sl_camera.camera import PIXEL_BITS
 from sl_projector.documents import dump_document, parse_document, read_text, write_text
 from sl_projector.errors import ConfigError
 
@@ -118,6 +119,7 @@ def write_config(source: Path, directory: Path, changes: Changes) -> Path:
         set_parameter(document, CALIBRATED[0], "calibration_file", changes.calibration)
     if changes.surface:
         set_parameter(document, BENCH, "surface", changes.surface)
+    _tell_full_scale(document)
     moved = {_moved(key, changes.namespace): value for key, value in document.items()}
     write_text(directory / "config.yaml", dump_document(moved))
     return directory / "config.yaml"
@@ -127,6 +129,15 @@ def set_parameter(document: dict[str, Any], node: str, name: str, value: object)
     """Set one parameter; its section is made when missing."""
     section = document.setdefault(node, {}).setdefault("ros__parameters", {})
     section[name] = str(value.resolve()) if isinstance(value, Path) else value
+
+
+def _tell_full_scale(document: dict[str, Any]) -> None:
+    """Let the reconstruction know where 10 and 12 bits end that come in 16-bit images."""
+    camera = document.get("/sl/camera", {}).get("ros__parameters", {})
+    bits = PIXEL_BITS.get(camera.get("pixel_format", "mono8"), 16)
+    reconstruct = document.get("/sl/reconstruct", {}).get("ros__parameters", {})
+    if bits not in (8, 16) and not reconstruct.get("saturation_dn"):
+        set_parameter(document, "/sl/reconstruct", "saturation_dn", (1 << bits) - 1)
 
 
 def _checked(document: Any, source: Path) -> dict[str, Any]:

@@ -1,13 +1,12 @@
 """Driver of GigE Vision and USB3 Vision cameras, through Aravis by GObject introspection.
 
-Aravis and `gi` are optional and imported when a camera is opened only. Feature names are SFNC's;
+Aravis is optional and imported when a camera is opened only. Feature names are SFNC's;
 older cameras' names (ExposureTimeAbs, GainRaw) are known where Aravis knows them.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ipaddress
 import math
 import time
 from collections.abc import Iterator
@@ -15,16 +14,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
+from sl_camera.aravis_library import find_camera, is_gone, load_aravis, words_of
 from sl_camera.camera import CameraSettings, CameraStatistics, Frame, FrameStatus
 from sl_camera.device_clock import DeviceClock
 from sl_camera.frame_ids import GVSP_PERIOD, FrameIds
 from sl_camera.pixel_formats import BY_CODE, CHOICES, WireFormat, unpack
 from sl_projector.errors import DeviceError, DeviceLost, DeviceRefused
 
-INSTALL = (
-    "Debian, Ubuntu: sudo apt install gir1.2-aravis-0.8 python3-gi; in a virtual environment see "
-    "docs/cameras.md"
-)
 #: Between two attempts to find a lost camera again.
 RETRY_S = 0.5
 #: The device's clock is read again so often: at 50 ppm it drifts 0.1 ms meanwhile.
@@ -36,9 +32,6 @@ LATCHES = (
     ("GevTimestampControlLatch", "GevTimestampValue"),
 )
 CHUNKS = ("FrameID", "Timestamp", "ExposureTime")
-#: Errors of Aravis (by name) that mean that the camera is gone or another program controls it.
-_GONE = ("NOT_FOUND", "NOT_CONNECTED", "NOT_CONTROLLER", "TIMEOUT", "TRANSFER_ERROR")
-_GONE_ACCESS = "PROTOCOL_ERROR_ACCESS_DENIED"
 #: From a software trigger to the exposure: the command's way, and a busy camera's readout.
 SOFTWARE_LATENCY_S = 0.05
 
@@ -63,61 +56,6 @@ class AravisOptions:
     packet_size: int = 0
     buffers: int = 64
     features: str = ""
-
-
-def load_aravis() -> Any:
-    """Return the module Aravis.
-
-    Raises
-    ------
-    DeviceError
-        When it is not installed; the message says the command that installs it.
-    """
-    try:
-        import gi
-
-        gi.require_version("Aravis", "0.8")
-        from gi.repository import Aravis
-    except (ImportError, ValueError) as error:
-        raise DeviceError(f"Aravis is missing ({error}); {INSTALL}") from error
-    return Aravis
-
-
-def list_cameras() -> list[str]:
-    """Ids, addresses and protocols of all cameras that answer, one line each."""
-    aravis = load_aravis()
-    aravis.update_device_list()
-    return [
-        f"{aravis.get_device_id(i)} at {aravis.get_device_address(i)} "
-        f"({aravis.get_device_protocol(i)})"
-        for i in range(aravis.get_n_devices())
-    ]
-
-
-def find_camera(aravis: Any, wanted: str) -> str:
-    """Return the id of the camera with this id, serial number or address; "" is the first.
-
-    An address is returned as it is: asking there directly spares a second of discovery.
-
-    Raises
-    ------
-    DeviceLost
-        When it does not answer.
-    """
-    if _is_address(wanted):
-        return wanted
-    aravis.update_device_list()
-    found = []
-    for i in range(aravis.get_n_devices()):
-        name = str(aravis.get_device_id(i))
-        names = (name, aravis.get_device_serial_nbr(i), aravis.get_device_address(i))
-        if wanted in ("", *names):
-            return name
-        found.append(name)
-    raise DeviceLost(
-        f"no GenICam camera {wanted or 'at all'}; found {', '.join(found) or 'none'}; is it "
-        "powered, in this machine's network, and not behind a firewall?"
-    )
 
 
 class AravisCamera:
@@ -259,7 +197,7 @@ class AravisCamera:
         except DeviceError:
             raise
         except Exception as error:
-            raise DeviceLost(f"{self._title()} cannot be opened: {_words(error)}") from error
+            raise DeviceLost(f"{self._title()} cannot be opened: {words_of(error)}") from error
         self._camera.get_device().connect("control-lost", self._on_lost)
         gige = self._camera.is_gv_device()
         lost, self._ids = self._ids.lost, FrameIds(GVSP_PERIOD if gige else 1 << 64)
@@ -317,17 +255,10 @@ class AravisCamera:
         except DeviceError:
             raise
         except Exception as error:  # GLib.Error, which needs gi to be named
-            words = _words(error)
-            if self._is_gone(error):
+            words = words_of(error)
+            if is_gone(self._aravis, error):
                 raise self._lost(f"could not {doing}: {words}") from error
             raise DeviceRefused(f"{self._title()}: could not {doing}: {words}") from error
-
-    def _is_gone(self, error: Exception) -> bool:
-        if getattr(error, "domain", "") != "arv-device-error-quark":
-            return False
-        code = getattr(error, "code", None)
-        names = (*_GONE, _GONE_ACCESS)
-        return code in [int(getattr(self._aravis.DeviceError, name)) for name in names]
 
     # -- settings ---------------------------------------------------------------------------
 
@@ -517,22 +448,9 @@ class AravisCamera:
         return {name: read[name](buffer, f"Chunk{name}") for name in self._chunk_names}
 
 
-def _is_address(text: str) -> bool:
-    try:
-        ipaddress.IPv4Address(text)
-    except ValueError:
-        return False
-    return True
-
-
 def _pair(found: Any) -> tuple[int, int]:
     """(width, height) of what Aravis returns as a named tuple."""
     return int(found[0]), int(found[1])
-
-
-def _words(error: Exception) -> str:
-    text = str(getattr(error, "message", "") or error)
-    return " ".join(text.split()) or type(error).__name__
 
 
 def _tick_ns(camera: Any) -> float:
