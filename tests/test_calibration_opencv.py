@@ -116,22 +116,23 @@ def test_free_poses_are_refused_where_there_are_too_few() -> None:
 
 def gray_code(stack: np.ndarray) -> np.ndarray:
     """Integers (H, W) of ten (pattern, inverse) pairs, most significant bit first."""
-    bits = np.cumsum(stack[0::2] > stack[1::2], axis=0) & 1  # each bit undoes those before it
-    return np.tensordot(1 << np.arange(9, -1, -1), bits, axes=1)
+    bits = np.logical_xor.accumulate(stack[0::2] > stack[1::2], axis=0)
+    return sum((bits[i].astype(np.int16) << (9 - i) for i in range(10)), np.int16(0))
 
 
 def board_view(capture: int) -> tuple[np.ndarray, np.ndarray]:
     """Chessboard corners in camera pixels, and the DMD coordinates there, by local homographies."""
     files = [BOARD / f"capture_{capture}" / f"graycode_{i:02d}.png" for i in range(42)]
-    stack = np.stack([cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]).astype(int)
-    mean = stack[:40].mean(axis=0)  # every pattern and its inverse: evenly lit, and less noise
-    flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
+    stack = np.stack([cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files])
+    mean = stack[:40].mean(
+        axis=0, dtype=np.float32
+    )  # every pattern and its inverse: evenly lit, and less noise
     image = (255 * mean / mean.max()).astype(np.uint8)
-    found, corners = cv2.findChessboardCornersSB(image, (9, 7), flags=flags)
+    found, corners = cv2.findChessboardCornersSB(image, (9, 7), flags=cv2.CALIB_CB_ACCURACY)
     assert found
     corners = corners.reshape(-1, 2).astype(float)
     dmd = np.stack([gray_code(stack[0:20]), gray_code(stack[20:40])], axis=-1).astype(float)
-    lit = stack[40] - stack[41] > 20
+    lit = cv2.subtract(stack[40], stack[41]) > 20
     thrown = []
     for corner in corners:
         u, v = np.round(corner).astype(int)[:, None, None] + 2 * np.mgrid[-20:21, -20:21]
