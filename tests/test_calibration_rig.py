@@ -170,6 +170,21 @@ def test_the_whole_way_ends_at_the_truth(worst) -> None:  # type: ignore[no-unty
     assert search.cost_after_px2 < search.cost_before_px2
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_however_the_plate_lies(seed: int) -> None:
+    """Tilts to 4 degrees, turns to 45, a stage out of square by half a degree, 0.5 % too long."""
+    rng = np.random.default_rng(seed)
+    x, y = np.deg2rad(rng.uniform(-4, 4, 2))
+    a, b, c = rng.normal(0, 0.01, 3)
+    mounting = Mounting((1, 1, rng.normal(1, 0.005)), (a, b, c), (x, y, rng.uniform(-0.8, 0.8)))
+    scene = Scene(mounting, hole_noise_px=0.02)
+    holes, targets = scene.views(seed)
+    for view in holes:
+        spoil(view.pixels, 0.05, rng.choice([0.3, 3, 30]), rng)
+    errors = point_errors(solve_rig(holes, targets, CAMERA, PROJECTOR).joint, scene)
+    assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 1.0e-6
+
+
 def test_the_worst_case_passes_the_gate(worst) -> None:  # type: ignore[no-untyped-def]
     solution, *_ = worst
     figures = solution.figures()
