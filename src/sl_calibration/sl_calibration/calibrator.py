@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -17,7 +17,15 @@ from sl_calibration.observe import observe
 from sl_calibration.plate import Plate
 from sl_calibration.report import write_report, write_verify_report
 from sl_calibration.samples import HoleView, TargetView
-from sl_calibration.session import Gear, Order, Progress, RunCancelled, Session, Tell
+from sl_calibration.session import (
+    Gear,
+    Order,
+    Progress,
+    RunCancelled,
+    Session,
+    Taken,
+    Tell,
+)
 from sl_calibration.solution import RigSolution, metres_per_pixel, solve_rig
 from sl_calibration.store import CALIBRATION, OBSERVATIONS, PAGE, Store
 from sl_calibration.uncertainty import EdgeNoise, Limits, Verdict, judge, sigma_map
@@ -113,6 +121,8 @@ class Calibrator:
         The stage stands where it was sent within this.
     verify_limit_m : float
         Error beyond which a check asks for a new calibration.
+    look : callable
+        Makes a view of a stack.
     """
 
     def __init__(
@@ -122,9 +132,11 @@ class Calibrator:
         pitches: Pitches,
         stage_tolerance_m: float = 5e-6,
         verify_limit_m: float = 3e-6,
+        look: Callable[[Taken, Order], View] = observe,
     ) -> None:
         self._store, self._limits, self._pitches = store, limits, pitches
         self._stage_tolerance_m, self._verify_limit_m = stage_tolerance_m, verify_limit_m
+        self._observe = look
 
     def calibrate(
         self, gear: Gear, order: Order, in_force: Calibration | None, tell: Tell
@@ -147,14 +159,15 @@ class Calibrator:
             return Outcome(str(error))
 
     def _run(self, gear: Gear, order: Order, tell: Tell) -> Outcome:
-        views: list[tuple[tuple[int, int], tuple[int, int]]] = []
+        sizes: list[tuple[tuple[int, int], tuple[int, int]]] = []
 
-        def look(taken: Any, asked: Order) -> View:
-            views.append((taken.images.shape[:0:-1], taken.sequence.dmd_size))
-            return observe(taken, asked)
+        def look(taken: Taken, asked: Order) -> View:
+            height, width = taken.images.shape[1:]
+            sizes.append(((width, height), taken.sequence.dmd_size))
+            return self._observe(taken, asked)
 
         taken = Session(gear, order, look, tell, self._stage_tolerance_m).views()
-        camera_size, dmd_size = views[0]
+        camera_size, dmd_size = sizes[0]
         observations = Observations(
             taken, camera_size, dmd_size, self._pitches.camera_m, self._pitches.projector_m,
             _made_from(order),

@@ -101,7 +101,7 @@ def _prepared(image: NDArray[np.generic], plate: Plate, full: float | None) -> t
     if high - low < MIN_RANGE * scale:
         raise CalibrationError(
             f"the image spans {low:.0f} to {high:.0f} DN; expected a lit plate with a range of at "
-            f"least {MIN_RANGE * scale:.0f} DN (is the lamp off?)"
+            f"least {MIN_RANGE * scale:.0f} DN (is the lamp off, or no plate with holes there?)"
         )
     return (grey, top) if plate.dark_holes else (np.float32(grey.max()) - grey, np.inf)
 

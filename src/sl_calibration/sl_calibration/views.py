@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
+from zlib import error as ZlibError  # noqa: N812
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,7 +136,7 @@ def load_observations(path: Path) -> Observations:
         )  # fmt: skip
     except CalibrationError:
         raise
-    except (OSError, KeyError, ValueError, TypeError, EOFError) as error:
+    except (OSError, KeyError, ValueError, TypeError, EOFError, BadZipFile, ZlibError) as error:
         raise CalibrationError(
             f"{path} holds no observations ({error}); expected the observations.npz of a run"
         ) from error
