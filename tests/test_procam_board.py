@@ -77,9 +77,6 @@ def plane_rms_m(points: np.ndarray) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(centred.T @ centred)[0] / len(points)))
 
 
-@pytest.mark.xfail(
-    strict=True, reason="wrong points on the dark squares: rms of all points 1.8 to 4.7 mm"
-)
 @pytest.mark.parametrize("capture", [0, 1, 2])
 def test_board_is_flat(true: tuple[int, Path, list[dict]], rig: Rig, capture: int) -> None:
     grid = corners_px(capture)

@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 from sl_reconstruct.edges import PRESENT
 from sl_reconstruct.geometry import DIVISION, Geometry, Optics, brown_undistort
 from sl_reconstruct.points import GEOMETRY, Output, Screen, find_steps
+from sl_reconstruct.reasons import Reason
 from sl_reconstruct.rows import Lines
+
+ROW = int(Reason.ROW)
 
 #: Row boundaries further apart than this are not interpolated between.
 MAX_GAP = 4
@@ -44,7 +47,7 @@ def map_rows(first: int, last: int, lines: Lines, screen: Screen, v_map: Any, ba
         last_j, last_y = -1, 0.0
         for j in range(at.size):
             y = np.float64(at[j])
-            if bad[j] or not y == y:
+            if bad[j] or np.isnan(y):
                 continue
             if last_j >= 0 and j - last_j <= MAX_GAP and y != last_y:
                 low, high = min(y, last_y), max(y, last_y)
@@ -55,7 +58,7 @@ def map_rows(first: int, last: int, lines: Lines, screen: Screen, v_map: Any, ba
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def row_at(v_map: Any, u: float, y: int) -> float:
+def row_at(v_map: Any, u: float, y: int) -> Any:
     """DMD row at camera column u, linear between the columns beside it; NaN where unknown."""
     x = int(np.floor(u))
     if not 0 <= x < v_map.shape[0] - 1:
@@ -65,7 +68,7 @@ def row_at(v_map: Any, u: float, y: int) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def undistorted(o: Optics, u: float, v: float) -> tuple[float, float]:
+def undistorted(o: Optics, u: float, v: float) -> Any:
     """Ideal slopes of an observed image point."""
     x, y = (u - o.cu) / o.fx, (v - o.cv) / o.fy
     if o.model == DIVISION:
@@ -77,7 +80,7 @@ def undistorted(o: Optics, u: float, v: float) -> tuple[float, float]:
 @njit(cache=True, nogil=True, error_model="numpy")
 def solve_four(
     g: Geometry, x: float, y: float, px: float, py: float, sigma_u: float, sigma_v: float, out: Any
-) -> bool:
+) -> Any:
     """Least squares over Eqs. (3) and (4), each weighted to pixels.
 
     x, y and px, py are ideal slopes in camera and projector. Writes to ``out``: world point,
@@ -112,7 +115,7 @@ def solve_four(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def miss_m(between: Any, ray: Any, other: Any) -> float:
+def miss_m(between: Any, ray: Any, other: Any) -> Any:
     """Shortest distance of two lines, given the vector between their origins."""
     n = np.cross(ray, other)
     return abs(np.dot(between, n)) / np.sqrt(np.dot(n, n))
@@ -125,7 +128,8 @@ def cross_rows(
 ) -> None:  # fmt: skip
     """Solve all four equations where a point of rows first to last has a DMD row.
 
-    Points without one keep the solution of the three equations, and NaN as miss distance.
+    Points without one are refused: three equations may leave depth all but free, as where the
+    devices lie above each other.
     """
     answer = np.zeros(6)
     for y in range(first, last):
@@ -135,7 +139,9 @@ def cross_rows(
             if out.reason[y, k] == PRESENT or out.reason[y, k] == GEOMETRY:
                 v = row_at(add.v_map, u, y)
             add.v_px[y, k] = v
-            if not v == v:
+            if np.isnan(v):
+                if out.reason[y, k] == PRESENT:
+                    out.values[y, k], out.reason[y, k] = np.nan, ROW
                 continue
             cx, cy = undistorted(g.camera, u, float(y))
             px, py = undistorted(g.projector, columns[k], v)

@@ -29,6 +29,8 @@ class Reason(IntEnum):
     MISSING = 9
     #: The rays do not meet in front of both devices, or miss each other by too much.
     GEOMETRY = 10
+    #: With row patterns: no DMD row is known there.
+    ROW = 11
 
 
 #: Reasons that count as refused, by the name used in reports.
