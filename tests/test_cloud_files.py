@@ -108,8 +108,8 @@ def test_a_failed_write_leaves_the_old_file(
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match="No space"):
+    with monkeypatch.context() as broken, pytest.raises(OSError, match="No space"):
+        broken.setattr(Path, "open", full)
         save_pcd(path, tilted())
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["cloud.pcd"]

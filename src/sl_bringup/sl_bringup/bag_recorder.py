@@ -89,7 +89,7 @@ class BagRecorder:
         self.close()
 
     @property
-    def bytes(self) -> int:
+    def size(self) -> int:
         """Bytes written so far."""
         return self._closed_bytes + self._writer.size
 

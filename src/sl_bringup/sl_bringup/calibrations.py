@@ -2,22 +2,36 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
 from sl_bringup.bags import CALIBRATION, Bag
 from sl_camera.matching import MatchedStack
-from sl_projector.errors import CalibrationError
+from sl_projector.errors import CalibrationError, SlError
 from sl_reconstruct.calibration_file import Calibration, load_calibration, parse_calibration
 
 
 @dataclass(frozen=True)
 class InForce:
-    """A calibration and where it comes from; ``received_ns`` is when it came into force."""
+    """A calibration and where it comes from.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration.
+    source : str
+        Where it comes from.
+    received_ns : int
+        When it came into force.
+    mismatch : str
+        What speaks against it: the bag holds another one. Empty when nothing does.
+    """
 
     calibration: Calibration
     source: str
     received_ns: int = 0
+    mismatch: str = ""
 
 
 class Calibrations:
@@ -38,8 +52,9 @@ class Calibrations:
 
     def __init__(self, bag: Bag, file: Path | None) -> None:
         self._file = file
-        self._read: dict[tuple[tuple[int, int], tuple[int, int]], InForce] = {}
-        self.recorded = [] if file else _recorded_calibrations(bag)
+        self._read: dict[tuple[tuple[int, int], tuple[int, int]], Calibration] = {}
+        self._lock = threading.Lock()
+        self.recorded = _recorded_hashes(bag) if file else _recorded_calibrations(bag)
         if file is None and not self.recorded:
             raise CalibrationError(
                 f"{bag.path} holds no calibration and none is named; expected "
@@ -48,16 +63,41 @@ class Calibrations:
 
     def of(self, stack: MatchedStack) -> InForce:
         """Calibration of a stack; a file may need the sizes that only the stack knows."""
+        recorded = self._recorded_at(stack.image_stamps_ns[0])
         if self._file is None:
-            start_ns = stack.image_stamps_ns[0]
-            known = [c for c in self.recorded if c.received_ns <= start_ns]
-            return known[-1] if known else self.recorded[0]
+            assert recorded is not None
+            return recorded
         _, height, width = stack.data.shape
-        sizes = ((width, height), stack.sequence.dmd_size)
-        if sizes not in self._read:
-            found = load_calibration(self._file, *sizes)
-            self._read[sizes] = InForce(found, str(self._file))
-        return self._read[sizes]
+        found = self._from_file(self._file, (width, height), stack.sequence.dmd_size)
+        differs = recorded is not None and recorded.calibration.hash != found.hash
+        mismatch = (
+            f"{self._file} ({found.hash[:12]}) is used, though the bag holds another calibration "
+            f"({recorded.calibration.hash[:12]}, {recorded.source})"
+            if recorded is not None and differs
+            else ""
+        )
+        return InForce(found, str(self._file), mismatch=mismatch)
+
+    def _recorded_at(self, stamp_ns: int) -> InForce | None:
+        known = [c for c in self.recorded if c.received_ns <= stamp_ns]
+        return known[-1] if known else next(iter(self.recorded), None)
+
+    def _from_file(
+        self, file: Path, image_size: tuple[int, int], dmd_size: tuple[int, int]
+    ) -> Calibration:
+        with self._lock:
+            key = (image_size, dmd_size)
+            if key not in self._read:
+                self._read[key] = load_calibration(file, image_size, dmd_size)
+            return self._read[key]
+
+
+def _recorded_hashes(bag: Bag) -> list[InForce]:
+    """Calibrations of the bag to compare with; a bag's bad one does no harm beside a good file."""
+    try:
+        return _recorded_calibrations(bag)
+    except SlError:
+        return []
 
 
 def _recorded_calibrations(bag: Bag) -> list[InForce]:

@@ -307,9 +307,7 @@ class McapFile:
             data += more
         return data
 
-    def _read(
-        self, chunk: _Chunk, wanted: Mapping[int, Connection], check: bool
-    ) -> list[Message]:
+    def _read(self, chunk: _Chunk, wanted: Mapping[int, Connection], check: bool) -> list[Message]:
         """Read the messages of a chunk in order of time; of a damaged one those that are whole."""
         found: list[Message] = []
         try:
@@ -400,9 +398,7 @@ def _walk(records: memoryview) -> Iterator[tuple[int, int, int]]:
         at += length
 
 
-def _merged(
-    chunks: Sequence[_Chunk], read: Callable[[_Chunk], list[Message]]
-) -> Iterator[Message]:
+def _merged(chunks: Sequence[_Chunk], read: Callable[[_Chunk], list[Message]]) -> Iterator[Message]:
     """Messages of all chunks in order of time; a chunk is read when its time comes."""
     waiting = sorted(chunks, key=lambda c: (c.start_ns, c.offset), reverse=True)
     heap: list[tuple[Message, Iterator[Message]]] = []

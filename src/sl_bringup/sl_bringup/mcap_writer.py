@@ -125,9 +125,7 @@ class McapWriter:
         number = len(self._channels) + 1
         kept = {"offered_qos_profiles": qos, "topic_type_hash": digest}
         ids = struct.pack("<H", number)
-        self._schemas.append(
-            record(SCHEMA, ids, text(msgtype), text("ros2msg"), text(definition))
-        )
+        self._schemas.append(record(SCHEMA, ids, text(msgtype), text("ros2msg"), text(definition)))
         self._channels.append(record(CHANNEL, ids, ids, text(topic), text("cdr"), texts(kept)))
         self._file.write(self._schemas[-1] + self._channels[-1])
         self.counts[number] = 0
@@ -167,9 +165,7 @@ class McapWriter:
         self._index_chunk(chunk, start, span, kind + struct.pack("<QQ", stored, chunk.bytes))
         self._file.flush()
 
-    def _index_chunk(
-        self, chunk: _Chunk, start: int, span: tuple[int, int], sizes: bytes
-    ) -> None:
+    def _index_chunk(self, chunk: _Chunk, start: int, span: tuple[int, int], sizes: bytes) -> None:
         """Write the chunk's message index, and keep its entry of the summary."""
         end = self._file.tell()
         offsets = b""
@@ -181,9 +177,7 @@ class McapWriter:
             )
         place = struct.pack("<QQQQ", *span, start, end - start)
         lengths = struct.pack("<I", len(offsets)), struct.pack("<Q", self._file.tell() - end)
-        self._chunks.append(
-            record(CHUNK_INDEX, place, lengths[0], offsets, lengths[1], sizes)
-        )
+        self._chunks.append(record(CHUNK_INDEX, place, lengths[0], offsets, lengths[1], sizes))
 
     def close(self) -> None:
         """Write the summary and close the file."""

@@ -72,7 +72,7 @@ class RecordNode(Node):  # type: ignore[misc]  # rclpy carries no types
     def told(self) -> str:
         """One line: what has been recorded."""
         count = sum(self._bag.counts.values())
-        line = f"{count} messages, {self.images} images, {self._bag.bytes / 1e6:.1f} MB"
+        line = f"{count} messages, {self.images} images, {self._bag.size / 1e6:.1f} MB"
         return f"{line}, {sum(self.lost.values())} lost" if self.lost else line
 
     def silent(self) -> list[str]:

@@ -6,7 +6,6 @@ import argparse
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import rclpy
 from rclpy.duration import Duration
@@ -53,9 +52,7 @@ class ReplayNode(Node):  # type: ignore[misc]  # rclpy carries no types
     def await_listeners(self, patience_s: float) -> bool:
         """Wait until somebody listens to a topic that is no latched one."""
         end_s = time.monotonic() + patience_s
-        while not any(
-            p.get_subscription_count() for t, p in self._to.items() if not t.latched
-        ):
+        while not any(p.get_subscription_count() for t, p in self._to.items() if not t.latched):
             if time.monotonic() >= end_s:
                 return False
             time.sleep(0.05)

@@ -11,13 +11,13 @@ from sl_bringup import pictures
 from sl_projector.documents import written_atomically
 from sl_projector.errors import StackError
 from sl_reconstruct.cloud import Cloud
-from sl_reconstruct.cloud_files import save_pcd, save_ply
+from sl_reconstruct.cloud_files import present, save_pcd, save_ply
 from sl_reconstruct.height_map import HeightMap, make_height_map, save_png, save_tiff
 from sl_reconstruct.plane_fit import Plane, fit_plane
 from sl_reconstruct.reasons import REFUSALS, Reason
 
-#: Points that a plane is fitted to; more change nothing.
-PLANE_POINTS = 500_000
+#: Points that a plane is fitted to, about; more change nothing.
+PLANE_POINTS = 100_000
 FILES = ("cloud.ply", "cloud.pcd", "height.tiff", "height.png", "report.json", "report.html")
 PICTURES = ("picture_height", "picture_relief", "picture_residual", "picture_profile",
             "picture_refusals")  # fmt: skip
@@ -49,8 +49,9 @@ def write_scan(
     if cloud is None:
         return {}
     notes = {key: report[key] for key in ("calibration_hash", "settings_hash", "cloud_hash")}
-    save_ply(folder / "cloud.ply", cloud.points, notes)
-    save_pcd(folder / "cloud.pcd", cloud.points, notes)
+    points = present(cloud.points)
+    save_ply(folder / "cloud.ply", points, notes)
+    save_pcd(folder / "cloud.pcd", points, notes)
     plane = _best_plane(cloud, report)
     height = _height_map(folder, cloud, report)
     if not with_pictures:
@@ -71,8 +72,8 @@ def clear_scan(folder: Path) -> None:
 
 
 def _best_plane(cloud: Cloud, report: dict[str, Any]) -> Plane | None:
-    xyz = cloud.xyz_m[np.isfinite(cloud.points["z"])]
-    plane = fit_plane(xyz[:: max(1, len(xyz) // PLANE_POINTS)].astype(np.float64))
+    every = max(1, round((cloud.points.size / PLANE_POINTS) ** 0.5))
+    plane = fit_plane(cloud.xyz_m[::every, ::every].reshape(-1, 3).astype(np.float64))
     if plane is not None:
         report["plane"] = {
             "rms_m": plane.rms_m,

@@ -7,7 +7,7 @@ there is no point: one row per camera row, one column per DMD column boundary.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,8 @@ def cloud_hash(points: NDArray[Any]) -> str:
 def present(points: NDArray[Any]) -> NDArray[Any]:
     """Points that are there, (n,), in row order."""
     flat = points.reshape(-1)
-    return np.asarray(flat[np.isfinite(flat["z"])])
+    there = np.isfinite(flat["z"])
+    return flat if there.all() else np.asarray(flat[there])
 
 
 def save_ply(path: str | Path, points: NDArray[Any], notes: Mapping[str, str] | None = None) -> int:
@@ -47,16 +48,16 @@ def save_ply(path: str | Path, points: NDArray[Any], notes: Mapping[str, str] | 
     int
         Number of points written.
     """
-    from plyfile import PlyData, PlyElement
-
-    kept = present(points)
-    comments = ["lengths in metres", *_lines(notes)]
-    vertices = np.empty(len(kept), dtype=[(name, "<f4") for name in POINT_FIELDS])
-    for name in POINT_FIELDS:
-        vertices[name] = kept[name]
-    element = PlyElement.describe(vertices, "vertex")
-    with written_atomically(Path(path)) as partial:
-        PlyData([element], byte_order="<", comments=comments).write(str(partial))
+    kept = _packed(present(points))
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {line}" for line in ("lengths in metres", *_lines(notes))),
+        f"element vertex {len(kept)}",
+        *(f"property float {name}" for name in POINT_FIELDS),
+        "end_header",
+    ]
+    _write(Path(path), lines, kept)
     return len(kept)
 
 
@@ -86,9 +87,7 @@ def save_pcd(
     """
     kept = points if organised else present(points)
     height, width = points.shape if organised else (1, len(kept))
-    packed = np.empty(kept.size, dtype=[(name, "<f4") for name in POINT_FIELDS])
-    for name in POINT_FIELDS:
-        packed[name] = kept[name].reshape(-1)
+    packed = _packed(kept.reshape(-1))
     lines = [
         "# .PCD v0.7 - Point Cloud Data file format",
         *(f"# {line}" for line in ("lengths in metres", *_lines(notes))),
@@ -103,9 +102,25 @@ def save_pcd(
         f"POINTS {packed.size}",
         "DATA binary",
     ]
-    with written_atomically(Path(path)) as partial:
-        partial.write_bytes(("\n".join(lines) + "\n").encode("ascii") + packed.tobytes())
+    _write(Path(path), lines, packed)
     return int(packed.size)
+
+
+def _packed(points: NDArray[Any]) -> NDArray[Any]:
+    """Points with the fields of the files and no others, side by side; a copy only if need be."""
+    wanted = np.dtype([(name, "<f4") for name in POINT_FIELDS])
+    if points.dtype == wanted:
+        return np.ascontiguousarray(points)
+    packed = np.empty(points.shape, dtype=wanted)
+    for name in POINT_FIELDS:
+        packed[name] = points[name]
+    return packed
+
+
+def _write(path: Path, lines: Sequence[str], points: NDArray[Any]) -> None:
+    with written_atomically(path) as partial, partial.open("wb") as file:
+        file.write(("\n".join(lines) + "\n").encode("ascii"))
+        file.write(points.data.cast("B") if points.size else b"")
 
 
 def _lines(notes: Mapping[str, str] | None) -> list[str]:

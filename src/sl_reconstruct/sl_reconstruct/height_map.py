@@ -57,8 +57,8 @@ def typical_spacing_m(points: NDArray[Any]) -> float:
     """
     spacings = []
     for a, b in ((points[:, :-1], points[:, 1:]), (points[:-1], points[1:])):
-        stride = max(1, a.size // SAMPLES)
-        a, b = a.reshape(-1)[::stride], b.reshape(-1)[::stride]
+        every = max(1, round((a.size / SAMPLES) ** 0.5))
+        a, b = a[::every, ::every], b[::every, ::every]
         apart = np.hypot(a["x"] - b["x"], a["y"] - b["y"])
         apart = apart[np.isfinite(apart)]
         spacings.append(float(np.median(apart)) if apart.size else np.nan)
@@ -88,10 +88,11 @@ def make_height_map(points: NDArray[Any], step_m: float | None = None) -> Height
     if not spacing > 0:
         raise StackError("the cloud has no two neighbouring points; expected a surface")
     step = spacing if step_m is None else step_m
-    x, y = points["x"].astype(np.float64), points["y"].astype(np.float64)
-    x0, y0 = np.floor(np.nanmin(x) / step) * step, np.ceil(np.nanmax(y) / step) * step
-    columns = int(np.ceil((np.nanmax(x) - x0) / step)) + 1
-    rows = int(np.ceil((y0 - np.nanmin(y)) / step)) + 1
+    x, y = points["x"], points["y"]
+    left, right, bottom, top = _bounds(x, y)
+    x0, y0 = np.floor(left / step) * step, np.ceil(top / step) * step
+    columns = int(np.ceil((right - x0) / step)) + 1
+    rows = int(np.ceil((y0 - bottom) / step)) + 1
     if rows * columns > MAX_NODES:
         raise StackError(
             f"a height map of {columns} x {rows} nodes {step:.3g} m apart is too large; expected "
@@ -99,25 +100,47 @@ def make_height_map(points: NDArray[Any], step_m: float | None = None) -> Height
         )
     z = np.full((rows, columns), np.nan, dtype=np.float32)
     limit = MAX_STRETCH * max(spacing, step)
-    _rasterise((x - x0) / step, (y0 - y) / step, points["z"].astype(np.float64), z, limit, step)
+    _rasterise(x, y, points["z"], z, (float(x0), float(y0), limit, float(step)))
     return HeightMap(z, float(x0), float(y0), float(step))
 
 
 @numba.njit(cache=True, nogil=True)
+def _bounds(x: NDArray[np.float32], y: NDArray[np.float32]) -> tuple[float, float, float, float]:
+    """Least and greatest x, least and greatest y of the points that are there."""
+    left, right, bottom, top = np.inf, -np.inf, np.inf, -np.inf
+    for r in range(x.shape[0]):
+        for c in range(x.shape[1]):
+            if np.isfinite(x[r, c]):
+                left, right = min(left, x[r, c]), max(right, x[r, c])
+                bottom, top = min(bottom, y[r, c]), max(top, y[r, c])
+    return left, right, bottom, top
+
+
+@numba.njit(cache=True, nogil=True)
 def _rasterise(
-    u: NDArray[np.float64],
-    v: NDArray[np.float64],
-    z: NDArray[np.float64],
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    z: NDArray[np.float32],
     out: NDArray[np.float32],
-    limit_m: float,
-    step_m: float,
+    grid: tuple[float, float, float, float],
 ) -> None:
-    """Fill the nodes under all triangles; u and v in nodes, z and the limit in metres."""
+    """Fill the nodes under all triangles; the grid is x0, y0, greatest length, step in metres.
+
+    Two rows at a time, in units of nodes: the cloud itself may lie in memory as it will.
+    """
     rows, columns = z.shape
-    for r in range(rows - 1):
+    x0_m, y0_m, limit_m, step_m = grid
+    u, v, w = np.empty((2, columns)), np.empty((2, columns)), np.empty((2, columns))
+    for r in range(rows):
+        for c in range(columns):
+            u[0, c], v[0, c], w[0, c] = u[1, c], v[1, c], w[1, c]
+            u[1, c], v[1, c] = (x[r, c] - x0_m) / step_m, (y0_m - y[r, c]) / step_m
+            w[1, c] = z[r, c]
+        if r == 0:
+            continue
         for c in range(columns - 1):
-            _triangle(u, v, z, out, limit_m, step_m, (r, c), (r, c + 1), (r + 1, c))
-            _triangle(u, v, z, out, limit_m, step_m, (r + 1, c + 1), (r + 1, c), (r, c + 1))
+            _triangle(u, v, w, out, limit_m, step_m, (0, c), (0, c + 1), (1, c))
+            _triangle(u, v, w, out, limit_m, step_m, (1, c + 1), (1, c), (0, c + 1))
 
 
 @numba.njit(cache=True, nogil=True)

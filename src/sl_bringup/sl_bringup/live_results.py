@@ -1,0 +1,70 @@
+"""What the live graph said of the scans in a recording, to be compared with an evaluation."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Mapping
+from typing import Any
+
+from sl_bringup.bags import REPORT, SETTINGS, Bag
+from sl_projector.errors import BagError, ConfigError
+from sl_reconstruct.settings import Settings
+
+
+def recorded_settings(bag: Bag) -> tuple[Settings | None, str]:
+    """Settings that the live clouds were made with, last ones first; and why there are none.
+
+    Returns
+    -------
+    settings : Settings or None
+        None where the bag has none that can be used: the defaults hold then.
+    note : str
+        Empty, or what is wrong with those in the bag.
+    """
+    if not bag.has(SETTINGS):
+        return None, ""
+    try:
+        texts = [recorded.message.data for recorded in bag.messages(SETTINGS, quick=True)]
+        return (Settings.from_dict(json.loads(texts[-1])) if texts else None), ""
+    except (BagError, ConfigError, ValueError, TypeError) as exc:
+        return None, f"the settings in the bag cannot be used, the defaults hold: {exc}"
+
+
+class LiveResults:
+    """Hashes of the live clouds by scan.
+
+    Parameters
+    ----------
+    bag : Bag
+        The recording; without `REPORT` in it nothing can be compared.
+    """
+
+    def __init__(self, bag: Bag) -> None:
+        self._reports: defaultdict[int, list[Any]] = defaultdict(list)
+        if bag.has(REPORT):
+            for recorded in bag.messages(REPORT, quick=True):
+                self._reports[recorded.message.scan_id].append(recorded.message)
+
+    def compare(self, report: Mapping[str, Any]) -> dict[str, Any]:
+        """Compare a scan's report with the live one.
+
+        Returns
+        -------
+        dict
+            ``agrees``: true (the same bits), false, or none where it cannot be said; ``told``.
+        """
+        live = self._reports.get(report["scan_id"], [])
+        if not live:
+            return {"agrees": None, "told": "the recording holds no live result of this scan"}
+        for message in live:
+            if message.cloud_hash == report["cloud_hash"]:
+                return {"agrees": True, "told": "the live cloud has the same hash",
+                        "cloud_hash": message.cloud_hash}  # fmt: skip
+        last = live[-1]
+        found: dict[str, Any] = {"agrees": None, "cloud_hash": last.cloud_hash}
+        for what in ("calibration", "settings"):
+            if getattr(last, f"{what}_hash") != report[f"{what}_hash"]:
+                return {**found, "told": f"the live cloud was made with another {what}"}
+        told = "the live cloud differs, though calibration and settings are the same"
+        return {**found, "agrees": False, "told": told}

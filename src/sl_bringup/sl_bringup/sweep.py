@@ -1,0 +1,166 @@
+"""``--sweep``: the same recordings with several settings, side by side in one table."""
+
+from __future__ import annotations
+
+import base64
+import html
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sl_bringup.report import micrometres, page, write_json
+from sl_projector.documents import write_text
+from sl_projector.errors import ConfigError
+
+#: More would be a mistake: each is a whole evaluation.
+MAX_VARIANTS = 64
+PICTURES = ("picture_residual.png", "picture_refusals.png")
+COLUMNS = ("scans", "good", "points", "of the lit", "sigma of z", "noise / bound", "plane rms")
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One column of settings in a sweep; empty assignments: no sweep at all."""
+
+    assignments: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """For people."""
+        return ", ".join(self.assignments)
+
+    @property
+    def folder(self) -> str:
+        """Below the output."""
+        return "_".join(text.replace("/", "-") for text in self.assignments)
+
+
+def variants(sweeps: Sequence[str]) -> Iterator[Variant]:
+    """All combinations of the values of ``name=a,b,c``.
+
+    Raises
+    ------
+    ConfigError
+        When one is no such assignment, a name comes twice, or there are too many.
+    """
+    axes = [_axis(sweep) for sweep in sweeps]
+    names = [axis[0].partition("=")[0] for axis in axes]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"--sweep names a setting twice: {', '.join(names)}")
+    count = int(np.prod([len(axis) for axis in axes], dtype=np.int64))
+    if count > MAX_VARIANTS:
+        raise ConfigError(f"--sweep makes {count} evaluations; expected at most {MAX_VARIANTS}")
+    return (Variant(chosen) for chosen in itertools.product(*axes))
+
+
+def _axis(sweep: str) -> list[str]:
+    name, equals, values = sweep.partition("=")
+    words = [word.strip() for word in values.split(",")]
+    if not (name and equals and all(words)) or len(set(words)) < len(words):
+        raise ConfigError(f"--sweep {sweep!r}; expected name=a,b,c with different values")
+    return [f"{name}={word}" for word in words]
+
+
+def write_sweep(
+    output: Path, results: Sequence[tuple[Variant, Sequence[tuple[Path, Mapping[str, Any]]]]]
+) -> list[str]:
+    """Write ``sweep.json`` and ``sweep.html``.
+
+    Parameters
+    ----------
+    output : Path
+        For both.
+    results : sequence of (Variant, sequence of (folder of the bag, report))
+        What came of each variant.
+
+    Returns
+    -------
+    list of str
+        The table, for a terminal.
+    """
+    rows = [
+        {"settings": list(v.assignments), **_row([r for _, r in found])} for v, found in results
+    ]
+    write_json(output / "sweep.json", {"format": 1, "variants": rows})
+    titles = [variant.title for variant, _ in results]
+    cells = [_cells(row) for row in rows]
+    pictures = [_pictures(found) for _, found in results]
+    write_text(output / "sweep.html", page("Sweep", _parts(titles, cells, pictures)))
+    width = max(len(title) for title in [*titles, "settings"])
+    lines = [f"{'settings':<{width}}" + "".join(f"{c:>16}" for c in COLUMNS)]
+    return lines + [
+        f"{title:<{width}}" + "".join(f"{cell:>16}" for cell in row)
+        for title, row in zip(titles, cells, strict=True)
+    ]
+
+
+def _row(reports: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Figures of a variant: medians over the scans that gave a cloud."""
+    measured = [r for r in reports if "points" in r]
+    return {
+        "scans": len(reports),
+        "good": sum(bool(r["good"]) for r in reports),
+        "points": _middle([r["points"] for r in measured]),
+        "present_fraction": _middle([r["present_fraction"] for r in measured]),
+        "median_sigma_m": _middle([r["median_sigma_m"] for r in measured]),
+        "bound_ratio": _middle([r["figures"]["bound_ratio"] for r in measured]),
+        "plane_rms_m": _middle([r["plane"]["rms_m"] for r in measured if "plane" in r]),
+        "settings_hash": reports[0]["settings_hash"] if reports else "",
+        "cloud_hashes": [r.get("cloud_hash", "") for r in reports],
+    }
+
+
+def _middle(values: Sequence[float]) -> float:
+    there = [v for v in values if np.isfinite(v)]
+    return float(np.median(there)) if there else float("nan")
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    def told(value: float, text: str) -> str:
+        return text.format(value) if np.isfinite(value) else "-"
+
+    return [
+        f"{row['scans']}",
+        f"{row['good']}",
+        told(row["points"], "{:,.0f}"),
+        told(100 * row["present_fraction"], "{:.2f} %"),
+        micrometres(row["median_sigma_m"]),
+        told(row["bound_ratio"], "{:.3f}"),
+        micrometres(row["plane_rms_m"]),
+    ]
+
+
+def _pictures(found: Sequence[tuple[Path, Mapping[str, Any]]]) -> list[bytes]:
+    """Pictures of the first scan that has any."""
+    for folder, report in found:
+        files = [folder / report["folder"] / name for name in PICTURES]
+        if all(file.is_file() for file in files):
+            return [file.read_bytes() for file in files]
+    return []
+
+
+def _parts(
+    titles: Sequence[str], cells: Sequence[Sequence[str]], pictures: Sequence[Sequence[bytes]]
+) -> list[str]:
+    """The page: the table, then each variant's pictures."""
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in ("settings", *COLUMNS))
+    rows = "".join(
+        f"<tr><th>{html.escape(title)}</th>"
+        + "".join(f'<td class="n">{html.escape(cell)}</td>' for cell in row)
+        + "</tr>"
+        for title, row in zip(titles, cells, strict=True)
+    )
+    parts = ["<h1>Sweep</h1>", f"<table><tr>{head}</tr>{rows}</table>",
+             "<p>Medians over the scans of each variant.</p>"]  # fmt: skip
+    for title, shown in zip(titles, pictures, strict=True):
+        parts.append(f"<h2>{html.escape(title)}</h2>")
+        parts += [
+            f'<img alt="{html.escape(title)}" '
+            f'src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+            for png in shown
+        ]
+    return parts
