@@ -1,4 +1,4 @@
-"""DMD coordinates at camera pixels, on images whose every DMD coordinate is known in closed form."""
+"""DMD coordinates at camera pixels, on images that closed forms give the coordinates of."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ def blurred(profile: NDArray[np.bool_]) -> NDArray[np.float64]:
     return np.asarray(gaussian_filter1d(np.repeat(padded, _FINE), BLUR_PX * SCALE * _FINE))
 
 
-def stack_of(sequence: PatternSequence, matrix: NDArray[np.float64], seed: int) -> NDArray[np.uint8]:
+def stack_of(
+    sequence: PatternSequence, matrix: NDArray[np.float64], seed: int
+) -> NDArray[np.uint8]:
     """What a camera sees of a flat under an affine map: stripes with Gaussian edges, noise."""
     u, v = np.meshgrid(np.arange(CAMERA[0]), np.arange(CAMERA[1]))
     dmd = np.stack([u, v], axis=-1) @ matrix[:, :2].T + matrix[:, 2]

@@ -48,7 +48,10 @@ def add_parser(subparsers: Any) -> None:
         help="stage heights of the views (default: the node's)",
     )  # fmt: skip
     parser.add_argument(
-        "--target", choices=["both", "camera", "projector"], default="both", help="what to calibrate"
+        "--target",
+        choices=["both", "camera", "projector"],
+        default="both",
+        help="what to calibrate",
     )
     parser.add_argument("--sequence", default="", help="patterns, both axes (default: the node's)")
     parser.add_argument(
@@ -79,7 +82,10 @@ def client_arguments(args: argparse.Namespace) -> list[str]:
 
 
 async def calibrate_once(
-    options: GraphOptions, client: Sequence[str], ready_timeout_s: float, tell: Callable[[str], None]
+    options: GraphOptions,
+    client: Sequence[str],
+    ready_timeout_s: float,
+    tell: Callable[[str], None],
 ) -> int:
     """Start a graph, calibrate, stop the graph; 0 only when all went well."""
 
@@ -141,9 +147,7 @@ def run(args: argparse.Namespace) -> int:
             return asyncio.run(calibrate_once(options, client, args.ready_timeout, tell))
     command = client_command(CLIENT, options, *client)
     try:
-        return subprocess.run(
-            command, env=client_environment(options), check=False
-        ).returncode
+        return subprocess.run(command, env=client_environment(options), check=False).returncode
     except KeyboardInterrupt:
         return INTERRUPTED
 
@@ -179,7 +183,10 @@ def outcome_lines(outcome: Outcome | Any) -> list[str]:
             f"left-out heights  {outcome.left_out_rms_m * 1e6:.3f} um rms of z",
         ]
     if outcome.calibration_file:
-        lines += [f"calibration       {outcome.calibration_file}", f"hash              {outcome.hash}"]
+        lines += [
+            f"calibration       {outcome.calibration_file}",
+            f"hash              {outcome.hash}",
+        ]
     if outcome.report:
         lines.append(f"report            {outcome.report}")
     return lines

@@ -54,7 +54,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument(
         "--calibrate", action="store_true",
-        help="with --up --bench: begin with a rig that nobody knows, calibrate it on the hole plate",
+        help="with --up --bench: begin with an unknown rig and calibrate it on the hole plate",
     )  # fmt: skip
     parser.add_argument(
         "--ready-timeout", type=float, default=240.0, metavar="S",

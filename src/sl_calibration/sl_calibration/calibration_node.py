@@ -69,12 +69,8 @@ class CalibrationNode(RigNode):
 
     def _offer(self) -> None:
         group = self.long_work
-        self.create_service(
-            Calibrate, "calibration/calibrate", self._serve, callback_group=group
-        )
-        self.create_service(
-            Verify, "calibration/verify", self._serve_verify, callback_group=group
-        )
+        self.create_service(Calibrate, "calibration/calibrate", self._serve, callback_group=group)
+        self.create_service(Verify, "calibration/verify", self._serve_verify, callback_group=group)
         self._action = ActionServer(
             self,
             CalibrateAction,
@@ -123,9 +119,7 @@ class CalibrationNode(RigNode):
             "plate_origin_diameter_m", 0.0, "diameter of the hole at the origin, m; 0: no mark",
             0.0, 1.0, live=True,
         )  # fmt: skip
-        self.declare(
-            "plate_chamfer_m", 0.0, "width of the holes' chamfers, m", 0.0, 1.0, live=True
-        )
+        self.declare("plate_chamfer_m", 0.0, "width of the holes' chamfers, m", 0.0, 1.0, live=True)
         self.declare(
             "plate_dark_holes", True, "dark holes in a bright plate; false: bright dots", live=True
         )
@@ -134,7 +128,9 @@ class CalibrationNode(RigNode):
         """Limits of the acceptance gate, each a parameter of its own."""
         values = {
             item.name: self.declare(
-                f"limit_{item.name}", float(item.default), f"acceptance: largest {item.name}"
+                f"limit_{item.name}",
+                float(getattr(Limits(), item.name)),
+                f"acceptance: largest {item.name}",
             )
             for item in fields(Limits)
         }
@@ -248,7 +244,7 @@ class CalibrationNode(RigNode):
             with self._gear.in_use(cancelled) as gear:
                 return self._calibrator.calibrate(gear, order, self._in_force, tell)
 
-        outcome = self._alone(work, Outcome)
+        outcome: Outcome = self._alone(work, Outcome)
         if outcome.success and outcome.calibration is not None:
             self._put_in_force(outcome.calibration, outcome.calibration_file, time.time_ns())
         return outcome

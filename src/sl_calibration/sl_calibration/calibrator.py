@@ -315,7 +315,7 @@ def _message(solved: Solved) -> str:
         return "not accepted, the calibration in force stays: " + "; ".join(solved.verdict.reasons)
     figures = solved.verdict.figures
     return (
-        f"accepted: z is known to {figures['point_sigma_m'] * 1e6:.3f} um in the volume (edge noise "
+        f"accepted: z known to {figures['point_sigma_m'] * 1e6:.3f} um in the volume (edge noise "
         f"apart), heights left out are met within {figures['left_out_z_m'] * 1e6:.3f} um"
     )
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sl_calibration.detect import find_plate
-from sl_calibration.views import View
 from sl_calibration.session import Order, Taken
+from sl_calibration.views import View
 from sl_projector.errors import CalibrationError
 from sl_projector.sequence import Pattern, PatternSequence
 from sl_reconstruct.correspondence import correspondences
@@ -65,14 +65,16 @@ def white_image(stack: NDArray[Any], sequence: PatternSequence) -> NDArray[np.fl
     total = np.zeros(stack.shape[1:], np.float32)
     for i in lit:
         total += stack[i]
-    if not (dark and pairs):
-        return total if not lit else total / len(lit)
     # A pair holds the ambient light twice, white holds it once.
-    ambient = np.mean([stack[i] for i in dark], axis=0, dtype=np.float32)
+    ambient = np.zeros_like(total)
+    for i in dark:
+        ambient += stack[i] / np.float32(len(dark))
     for i, j in pairs:
         total += stack[i]
         total += stack[j]
-    return (total - len(pairs) * ambient) / np.float32(len(lit) + len(pairs))
+    white: NDArray[np.float32] = total - np.float32(len(pairs)) * ambient
+    white /= len(lit) + len(pairs)
+    return white
 
 
 def _full(pattern: Pattern) -> bool | None:
@@ -100,7 +102,7 @@ def check_light(stack: NDArray[Any], sequence: PatternSequence) -> None:
     found = float(np.quantile(light, 1.0 - MIN_LIT_PART))
     if found < MIN_LIGHT * full:
         raise CalibrationError(
-            f"the projector's light makes a difference of {found:.0f} of {full:.0f} DN; expected at "
-            f"least {MIN_LIGHT * full:.0f} in {MIN_LIT_PART:.0%} of the image: is its lamp on, "
+            f"the projector's light makes a difference of {found:.0f} of {full:.0f} DN; expected "
+            f"at least {MIN_LIGHT * full:.0f} in {MIN_LIT_PART:.0%} of the image: is its lamp on, "
             "does it reach the plate, and is the camera exposed long enough?"
         )

@@ -154,7 +154,7 @@ def _heights(solved: Solved) -> list[dict[str, Any]]:
     return rows
 
 
-# -- the page ---------------------------------------------------------------------------------------
+# -- the page -------------------------------------------------------------------------------------
 
 
 def _page(solved: Solved, content: Mapping[str, Any]) -> str:
@@ -197,7 +197,11 @@ def _figure_rows(content: Mapping[str, Any]) -> list[tuple[str, ...]]:
     noise = content["edge_sigma_px"]
     return [
         *rows,
-        (f"1-sigma of z with the noise of one edge ({noise:.3f} px), worst", f"{sigma:.4g} µm", "-"),
+        (
+            f"1-sigma of z with the noise of one edge ({noise:.3f} px), worst",
+            f"{sigma:.4g} µm",
+            "-",
+        ),
     ]
 
 
@@ -260,7 +264,7 @@ def _centre_cell(device: Mapping[str, Any]) -> str:
 def _search_rows(content: Mapping[str, Any]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     head = ("Device", "J, centre in the middle, px²", "J at the minimum, px²", "Points",
             "Centre found, px", "f, px", "Linear steps")  # fmt: skip
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name in ("camera", "projector"):
         s = content[name]["paper_search"]
         u, v = s["image_centre_px"]
@@ -272,7 +276,7 @@ def _search_rows(content: Mapping[str, Any]) -> tuple[tuple[str, ...], list[tupl
 
 
 def _stage_rows(stage: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for axis, scale, sigma in zip("xyz", stage["scale"], stage["scale_sigma"], strict=True):
         if math.isfinite(scale):
             rows.append(
@@ -301,7 +305,7 @@ def _height_rows(
 
 
 def _origin_rows(content: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    rows = [("calibration hash", str(content["hash"])),
+    rows: list[tuple[str, ...]] = [("calibration hash", str(content["hash"])),
             ("solving", f"{content['solving_s']:.2f} s")]  # fmt: skip
     return rows + [
         (str(name), json.dumps(_plain(value), ensure_ascii=False))
@@ -332,7 +336,7 @@ def _text(value: str) -> str:
     return html.escape(value, quote=True)
 
 
-# -- a check of the calibration in force ------------------------------------------------------------
+# -- a check of the calibration in force ----------------------------------------------------------
 
 
 def write_verify_report(
@@ -348,6 +352,8 @@ def write_verify_report(
     title = f"Check of the calibration in force on the {check.target}"
     banner = f'<p class="verdict {"good" if good else "bad"}">{_text(message)}</p>'
     rows = [(name.replace("_", " "), f"{value}") for name, value in content.items()]
-    picture = _picture("Points off the best plane", png(off_plane(check.points_m, check.off_plane_m)))
+    picture = _picture(
+        "Points off the best plane", png(off_plane(check.points_m, check.off_plane_m))
+    )
     parts = [f"<h1>{_text(title)}</h1>", banner, _table("Figures", ("", ""), rows), picture]
     write_text(folder / PAGE, _document(title, parts))

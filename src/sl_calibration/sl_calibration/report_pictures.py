@@ -29,7 +29,8 @@ _MOST_ARROWS = 600
 def png(figure: Figure) -> bytes:
     """Picture of a figure."""
     buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)
+    FigureCanvasAgg(figure)  # drawn by it from here on
+    figure.savefig(buffer, format="png")
     return buffer.getvalue()
 
 

@@ -15,8 +15,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_calibration.views import View
 from sl_calibration.plate import Plate
+from sl_calibration.views import View
 from sl_projector.errors import CalibrationError, SlError
 from sl_projector.sequence import PatternSequence
 
@@ -62,8 +62,8 @@ class Order:
             raise CalibrationError(f"heights_m={self.heights_m}; expected finite numbers")
         if len(self.distinct) < MIN_HEIGHTS:
             raise CalibrationError(
-                f"{len(self.distinct)} different heights (of {list(self.heights_m)} m); expected at "
-                f"least {MIN_HEIGHTS}, {MIN_STEP_M * 1e6:g} um or more apart: from one height "
+                f"{len(self.distinct)} different heights (of {list(self.heights_m)} m); expected "
+                f"at least {MIN_HEIGHTS}, {MIN_STEP_M * 1e6:g} um or more apart: from one height "
                 "neither focal length and distance nor the stage can be told apart"
             )
 
@@ -235,8 +235,8 @@ class Session:
     def _check_height(self, found_m: float, asked_m: float) -> None:
         if not abs(found_m - asked_m) <= self._tolerance_m:
             raise CalibrationError(
-                f"the stage stands at {found_m * 1e3:.4f} mm but was sent to {asked_m * 1e3:.4f} mm; "
-                f"expected it within {self._tolerance_m * 1e6:g} um: it does not move as told"
+                f"the stage stands at {found_m * 1e3:.4f} mm but was sent to {asked_m * 1e3:.4f} "
+                f"mm; expected it within {self._tolerance_m * 1e6:g} um: it does not move as told"
             )
 
     def _report(self, stage: str, i: int) -> None:
@@ -263,7 +263,7 @@ def check_motion(before: View, after: View) -> None:
     moved_px = np.linalg.norm(after.centres_px[b] - before.centres_px[a], axis=1)
     if float(np.median(moved_px)) < MIN_MOTION_PX:
         raise CalibrationError(
-            f"the stage says that it moved by {(after.height_m - before.height_m) * 1e3:.4f} mm but "
-            f"the holes' images moved by {float(np.median(moved_px)):.3f} px; expected at least "
+            f"the stage says that it moved by {(after.height_m - before.height_m) * 1e3:.4f} mm "
+            f"but the holes' images moved by {float(np.median(moved_px)):.3f} px; expected at least "
             f"{MIN_MOTION_PX} px: the stage, or the plate on it, does not move"
         )

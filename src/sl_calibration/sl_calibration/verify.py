@@ -160,7 +160,7 @@ def _lattice(rig: Rig, points: Array, centres_px: Array, plate_xy_m: Array) -> t
     holes = origin + depth[:, np.newaxis] * rays
     model = np.pad(plate_xy_m, ((0, 0), (0, 1)))
     p, q = holes - holes.mean(axis=0), model - model.mean(axis=0)
-    left, size, right = np.linalg.svd(q.T @ p)
+    left, _, right = np.linalg.svd(q.T @ p)
     sign = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
     turned = q @ left @ sign @ right
     return _rms(np.linalg.norm(p - turned, axis=1)), float(np.sum(p * turned) / np.sum(q * q))

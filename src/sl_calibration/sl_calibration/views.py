@@ -108,8 +108,9 @@ def save_observations(path: Path, observations: Observations) -> None:
         for i, view in enumerate(observations.views)
         for name, value in asdict(view).items()
     }
+    arrays["about"] = np.array(json.dumps(about))
     with written_atomically(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def load_observations(path: Path) -> Observations:
@@ -122,7 +123,7 @@ def load_observations(path: Path) -> Observations:
     """
     names = View.__dataclass_fields__
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as whole, np.load(whole, allow_pickle=False) as file:
             about = json.loads(str(file["about"]))
             _check_format(about, path)
             views = [

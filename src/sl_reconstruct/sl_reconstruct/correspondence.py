@@ -145,9 +145,7 @@ def _lines(stack: NDArray[Any], plan: DecodePlan, settings: Settings) -> Lines:
     axis = plan.column
     layout = make_layout(axis, plan.white, plan.black)
     ys = survey_rows(stack.shape[1])
-    tuning, edge_filter, bars, *_ = survey(
-        stack, ys, axis, layout, settings, _empty(ys.size, axis)
-    )
+    tuning, edge_filter, bars, *_ = survey(stack, ys, axis, layout, settings, _empty(ys.size, axis))
     lines = _empty(stack.shape[1], axis)
     every = np.arange(stack.shape[1])
     arguments = (stack, layout, edge_filter, tuning, bars, lines)
