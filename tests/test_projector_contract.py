@@ -1,7 +1,8 @@
 """What every projector driver promises (`ProjectorDriver`), on every driver.
 
 On a real projector as well: ``pytest tests/test_projector_contract.py --hardware dlpc900=usb``
-(or ``dlpc900=usb:SERIAL``; another DMD than the DLP5500 as ``dlpc900=usb@DLP6500``). It will flash.
+(or ``dlpc900=usb:SERIAL``; another DMD than the DLP5500 as ``dlpc900=usb@DLP6500``; a LightCrafter
+4500 whose flash holds `paper` as ``dlpc900=usb@DLP4500``). It will flash.
 """
 
 from contextlib import contextmanager
@@ -9,12 +10,16 @@ from contextlib import contextmanager
 import pytest
 
 from dlpc900_bench import Bench
-from sl_bench.usb_server import UsbSocketServer
+from sl_bench.dlpc350_emulator import IDENTITY, Dlpc350Emulator
+from sl_bench.usb_server import EmulatedUsb, UsbSocketServer
 from sl_projector.clock import SystemClock
+from sl_projector.dlpc350 import Dlpc350, Dlpc350Settings
+from sl_projector.dlpc350_flash import write_flash_images
 from sl_projector.dlpc900 import Dlpc900
-from sl_projector.dmd import DEFAULT_MODEL, ProjectorDriver, Timing
+from sl_projector.dmd import DEFAULT_MODEL, ProjectorDriver, Timing, dmd_model
 from sl_projector.errors import ConfigError, DeviceError, SequenceError
 from sl_projector.sequence import Pattern, PatternSequence, named
+from sl_projector.usb_socket import LinkBackend
 
 TIMING = Timing(2e-3, 500e-6)
 HARDWARE = "dlpc900="
@@ -35,15 +40,31 @@ def in_another_process(tmp_path):
 
 
 @contextmanager
+def lightcrafter(tmp_path):
+    flash = (named("paper", dmd_model("DLP4500").size),)
+    emulator = Dlpc350Emulator(write_flash_images(flash, tmp_path))
+    bus = EmulatedUsb(emulator, IDENTITY)
+    settings = Dlpc350Settings(reply_timeout_s=0.5, flash=flash)
+    yield Dlpc350(settings=settings, backend=LinkBackend(bus.connect()))
+
+
+@contextmanager
 def real(address):
     device, _, model = address.partition("@")
-    yield Dlpc900(device, model or DEFAULT_MODEL)
+    if model == "DLP4500":
+        flash = (named("paper", dmd_model(model).size),)
+        yield Dlpc350(device, Dlpc350Settings(flash=flash))
+    else:
+        yield Dlpc900(device, model or DEFAULT_MODEL)
+
+
+KINDS = {"emulated": emulated, "socket": in_another_process, "dlpc350": lightcrafter}
 
 
 def pytest_generate_tests(metafunc):
     asked = metafunc.config.getoption("--hardware")
     real_ones = [kind for kind in asked if kind.startswith(HARDWARE)]
-    metafunc.parametrize("kind", ["emulated", "socket", *real_ones])
+    metafunc.parametrize("kind", ["emulated", "socket", "dlpc350", *real_ones])
 
 
 @pytest.fixture
@@ -51,7 +72,7 @@ def driver(kind, tmp_path):
     if kind.startswith(HARDWARE):
         context = real(kind.removeprefix(HARDWARE))
     else:
-        context = {"emulated": emulated, "socket": in_another_process}[kind](tmp_path)
+        context = KINDS[kind](tmp_path)
     with context as made:
         made.open()
         yield made

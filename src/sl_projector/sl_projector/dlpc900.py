@@ -74,7 +74,7 @@ class Dlpc900Settings:
 
 
 @dataclass(frozen=True)
-class _Loaded:
+class Loaded:
     """What the device holds."""
 
     digest: str
@@ -106,6 +106,10 @@ class Dlpc900:
         What runs are timed by.
     """
 
+    _product_id = protocol.PRODUCT_ID
+    _port_class = Dlpc900Port
+    _pattern_mode = protocol.MODE_ON_THE_FLY
+
     def __init__(
         self,
         device: str = "usb",
@@ -123,7 +127,7 @@ class Dlpc900:
         self._lock = threading.RLock()
         self._stopped = threading.Event()
         self._port: Dlpc900Port | None = None
-        self._loaded: _Loaded | None = None
+        self._loaded: Loaded | None = None
         self._run: RunInfo | None = None
         self._idle = False
 
@@ -149,10 +153,8 @@ class Dlpc900:
         warm_up()
         with self._lock:
             self._release()
-            transport = open_usb(
-                self._device, protocol.VENDOR_ID, protocol.PRODUCT_ID, self._backend
-            )
-            self._port = Dlpc900Port(transport, self._settings.reply_timeout_s, self._clock)
+            transport = open_usb(self._device, protocol.VENDOR_ID, self._product_id, self._backend)
+            self._port = self._port_class(transport, self._settings.reply_timeout_s, self._clock)
             try:
                 self._prepare(self._port)
             except DeviceError:
@@ -237,7 +239,7 @@ class Dlpc900:
     def _check_hardware(self, port: Dlpc900Port, step: str) -> None:
         problems = protocol.hardware_problems(port.read(protocol.HARDWARE_STATUS)[0])
         if problems:
-            raise DeviceError(f"DLPC900 after {step}: {', '.join(problems)}")
+            raise DeviceError(f"{port.chip} after {step}: {', '.join(problems)}")
 
     def status(self) -> ProjectorStatus:
         """See `ProjectorDriver`."""
@@ -329,7 +331,7 @@ class Dlpc900:
         self._configure(port, len(planes.places), repeats=1)
         self._send_images(port, images)
         self._check_hardware(port, "loading the sequence")
-        self._loaded = _Loaded(digest, planes.places, timing, repeats=1)
+        self._loaded = Loaded(digest, planes.places, timing, repeats=1)
         return LoadInfo(
             digest,
             uploaded=True,
@@ -351,7 +353,7 @@ class Dlpc900:
         if self._idle:
             self._leave_idle(port)
 
-    def _program(self, port: Dlpc900Port, loaded: _Loaded, timing: Timing, repeats: int) -> None:
+    def _program(self, port: Dlpc900Port, loaded: Loaded, timing: Timing, repeats: int) -> None:
         """Bring the pattern table to another timing or count; the images stay."""
         if (timing, repeats) == (loaded.timing, loaded.repeats):
             return
@@ -359,7 +361,7 @@ class Dlpc900:
         if timing != loaded.timing:
             self._define_patterns(port, loaded.places, timing)
         self._configure(port, len(loaded.places), repeats)
-        self._loaded = _Loaded(loaded.digest, loaded.places, timing, repeats)
+        self._loaded = Loaded(loaded.digest, loaded.places, timing, repeats)
 
     def _configure(self, port: Dlpc900Port, count: int, repeats: int) -> None:
         port.write(protocol.LUT_CONFIG, protocol.lut_config(count, count * repeats))
@@ -417,10 +419,10 @@ class Dlpc900:
 
     def _check_ready(self, port: Dlpc900Port) -> None:
         mode = port.read(protocol.DISPLAY_MODE)[0]
-        if mode != protocol.MODE_ON_THE_FLY:
+        if mode != self._pattern_mode:
             self._loaded = None
             raise DeviceError(
-                f"display mode is {mode}, expected {protocol.MODE_ON_THE_FLY} with the loaded "
+                f"display mode is {mode}, expected {self._pattern_mode} with the loaded "
                 "sequence: the device was reset or another program used it; load again"
             )
         if port.read(protocol.MAIN_STATUS)[0] & protocol.MAIN_RUNNING:

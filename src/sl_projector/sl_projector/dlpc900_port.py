@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from sl_projector import dlpc900_protocol as protocol
 from sl_projector.clock import Clock, SystemClock
@@ -33,6 +33,10 @@ class Dlpc900Port:
     clock : Clock
         What `write_once` tells the time by.
     """
+
+    #: What messages call the controller, and its commands.
+    chip = "DLPC900"
+    names: Mapping[int, str] = protocol.NAMES
 
     def __init__(
         self,
@@ -80,7 +84,7 @@ class Dlpc900Port:
             self._refuse(command, reply)
         if len(reply.data) < size:
             raise DeviceError(
-                f"DLPC900 answered 0x{command:04X} ({protocol.NAMES.get(command)}) with "
+                f"{self.chip} answered 0x{command:04X} ({self.names.get(command)}) with "
                 f"{len(reply.data)} bytes; expected at least {size}"
             )
         return reply.data
@@ -135,7 +139,7 @@ class Dlpc900Port:
 
     def _send(self, command: int, data: bytes, *, read: bool, reply: bool) -> int:
         if self._closed:  # pyusb would open the device again, behind everybody's back
-            raise DeviceLost("the connection to the DLPC900 was closed")
+            raise DeviceLost(f"the connection to the {self.chip} was closed")
         self._sequence = self._sequence % 255 + 1  # never 0: padding would look like an answer
         packet = protocol.message(command, data, read=read, reply=reply, sequence=self._sequence)
         began_ns = self._clock.now_ns()
@@ -156,7 +160,7 @@ class Dlpc900Port:
                 return reply
             self.stale_replies += 1  # late answer to an earlier command, or cut short
         raise DeviceTimeout(
-            f"DLPC900 did not answer 0x{command:04X} ({protocol.NAMES.get(command)}) "
+            f"{self.chip} did not answer 0x{command:04X} ({self.names.get(command)}) "
             f"within {self._reply_timeout_s} s"
         )
 

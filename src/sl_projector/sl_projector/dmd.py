@@ -37,6 +37,8 @@ class DmdModel:
         Shortest exposure of bit depth 1, 2, ... 8, microseconds, all blocks active.
     dual : bool
         Two controllers, each with one half of the columns (the left half is the primary's).
+    controller : {"DLPC900", "DLPC350"}
+        TI's controller, which decides on the driver.
     """
 
     name: str
@@ -47,6 +49,7 @@ class DmdModel:
     block_load_us: tuple[int, ...]
     min_exposure_us: tuple[int, ...]
     dual: bool = False
+    controller: str = "DLPC900"
 
     @property
     def size(self) -> tuple[int, int]:
@@ -63,6 +66,7 @@ _DEPTHS_SINGLE = (304, 394, 823, 1215, 1487, 1998, 4046)
 _DEPTHS_DUAL = (304, 380, 733, 1215, 1487, 1998, 4046)
 _BLOCKS_6500 = (24, 45, 45, 45, 48, 54, 60, 66, 72, 78, 84, 90, 96, 101, 105)
 _BLOCKS_9000 = (24, 42, 42, 42, 45, 51, 56, 61, 67, 72, 77, 83, 88, 93, 99, 105)
+_DEPTHS_350 = (235, 700, 1570, 1700, 2000, 2500, 4500, 8333)
 _BLOCKS_5500 = (25, 30, 35, 28, 33, 38, 43, 48, 53, 58, 63, 68, 73, 78, 83)
 
 # Sizes of DLP670S and DLP500YX and their block tables are not confirmed by a second source; of
@@ -76,6 +80,8 @@ MODELS: dict[str, DmdModel] = {
         DmdModel("DLP670S", 3, 2716, 1600, 400, _BLOCKS_9000, (105, *_DEPTHS_DUAL), dual=True),
         DmdModel("DLP500YX", 4, 2048, 1200, 800, (62,), (62, *_DEPTHS_DUAL), dual=True),
         DmdModel("DLP5500", 5, 1024, 768, 1024, _BLOCKS_5500, (83, *_DEPTHS_SINGLE)),
+        # LightCrafter 4500: it has no hardware code; its mirrors stand on their corners.
+        DmdModel("DLP4500", -1, 912, 1140, 1824, (235,), _DEPTHS_350, controller="DLPC350"),
     )
 }
 DEFAULT_MODEL = "DLP5500"

@@ -24,6 +24,7 @@ from sl_projector.base_node import (
     run,
 )
 from sl_projector.device_link import DeviceLink
+from sl_projector.dlpc350 import Dlpc350, Dlpc350Settings
 from sl_projector.dlpc900 import Dlpc900, Dlpc900Settings
 from sl_projector.dmd import (
     DEFAULT_MODEL,
@@ -90,7 +91,7 @@ class ProjectorNode(RigNode):
     ) -> None:
         super().__init__("projector", **options)
         self._declare_parameters()
-        self._make_driver = make_driver or self._make_dlpc900
+        self._make_driver = make_driver or self._make_configured
         self._busy = threading.Lock()
         self._stop = threading.Event()
         self._halted = threading.Event()
@@ -120,6 +121,9 @@ class ProjectorNode(RigNode):
         )
         self._leds = self.declare("leds", 7, "LEDs: 1 red + 2 green + 4 blue", 0, 7)
         self.declare("sequence", "precise", "sequence of a request that names none", live=True)
+        self._flash = self.declare(
+            "flash_sequences", ["precise"], "DLPC350: the sequences in its flash, in order"
+        )
         self._directory = self.declare(
             "sequence_dir", "", "directory whose sequence files may be asked for by name"
         )
@@ -149,7 +153,10 @@ class ProjectorNode(RigNode):
         self._poller.join(timeout=5.0)
         super().close()
 
-    def _make_dlpc900(self) -> ProjectorDriver:
+    def _make_configured(self) -> ProjectorDriver:
+        if self._model.controller == "DLPC350":
+            flash = tuple(named(name, self._model.size) for name in self._flash)
+            return Dlpc350(self._device, Dlpc350Settings(leds=self._leds, flash=flash))
         return Dlpc900(self._device, self._model, Dlpc900Settings(leds=self._leds))
 
     def _connect(self) -> ProjectorDriver:
