@@ -14,7 +14,8 @@ from sl_bringup.report import micrometres, write_json, write_page
 from sl_bringup.scan_files import write_scan
 from sl_reconstruct.cloud import CLOUD_DTYPE, Cloud
 from sl_reconstruct.cloud_files import cloud_hash
-from sl_reconstruct.groove import Groove, measure_groove
+from sl_reconstruct.measure.groove import measure_groove
+from sl_reconstruct.measure.planes import AngleMeasurement
 from sl_reconstruct.reasons import Reason
 
 MEASURES = ("groove",)
@@ -96,15 +97,19 @@ def _cloud(points: NDArray[Any], report: Mapping[str, Any]) -> Cloud:
                  report["lit_positions"])  # fmt: skip
 
 
-def _groove(found: Groove | None) -> dict[str, Any]:
+def _groove(found: AngleMeasurement | None) -> dict[str, Any]:
     if found is None:
         return {"found": False}
-    sides = {"left": found.left, "right": found.right}
     planes = {
-        name: {"normal": p.normal, "point_m": p.point_m, "rms_m": p.rms_m, "points": p.used}
-        for name, p in sides.items()
+        name: {"normal": p.normal, "point_m": p.point_m, "rms_m": p.rms_m, "points": p.points}
+        for name, p in (("left", found.first), ("right", found.second))
     }
-    return {"found": True, "included_angle_deg": found.included_angle_deg, **planes}
+    return {
+        "found": True,
+        "included_angle_deg": found.value,
+        "u_included_angle_deg": found.uncertainty,
+        **planes,
+    }
 
 
 def summary(report: Mapping[str, Any]) -> Iterator[str]:
@@ -146,6 +151,7 @@ def _groove_lines(report: Mapping[str, Any]) -> Iterator[str]:
             f"{side + ' flank':<18}normal ({x:+.5f}, {y:+.5f}, {z:+.5f}), "
             f"rms {micrometres(plane['rms_m'])}, {plane['points']:,} points"
         )
-    yield f"included angle    {groove['included_angle_deg']:.4f} degrees"
+    angle, u = groove["included_angle_deg"], groove["u_included_angle_deg"]
+    yield f"included angle    {angle:.4f} degrees, standard uncertainty {u:.4f}"
     yield ""
     yield from table_2_lines(report)

@@ -61,13 +61,17 @@ def fit_plane(xyz_m: Array) -> Plane | None:
         plane = _fit(kept, len(points))
         if plane is None:
             return None
-        distance = np.abs(plane.distances_m(points))
-        spread = float(np.median(distance)) / MEDIAN_ABS_NORMAL
-        inside = points[distance <= TRIM_SD * spread]
+        distance = plane.distances_m(points)
+        inside = points[np.abs(distance) <= TRIM_SD * robust_sd(distance)]
         if len(inside) == len(kept) or len(inside) < 3:
             break
         kept = inside
     return plane
+
+
+def robust_sd(residual: Array) -> float:
+    """Standard deviation of normal residuals from the median of their sizes."""
+    return float(np.median(np.abs(residual))) / MEDIAN_ABS_NORMAL
 
 
 def _fit(points: Array, total: int) -> Plane | None:

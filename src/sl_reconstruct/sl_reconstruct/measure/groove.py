@@ -1,14 +1,15 @@
-"""The V-groove of a cloud: its two flanks as planes, and the angle between them."""
+"""The V-groove of a cloud: its two flanks, found by their slopes, and the angle between them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_reconstruct.plane_fit import Plane, fit_plane
+from sl_projector.errors import StackError
+from sl_reconstruct.measure.planes import AngleMeasurement, measure_angle
+from sl_reconstruct.measure.region import select
 
 #: The slope at a point is taken from points so many column boundaries on either side.
 REACH = 16
@@ -20,28 +21,8 @@ LEAST_SLOPE_DIFFERENCE = 0.02
 NEAR = 0.25
 
 
-@dataclass(frozen=True)
-class Groove:
-    """A measured groove.
-
-    Parameters
-    ----------
-    left, right : Plane
-        The flank that falls and the one that rises towards larger x.
-    """
-
-    left: Plane
-    right: Plane
-
-    @property
-    def included_angle_deg(self) -> float:
-        """Angle between the flanks, degrees; 180 is flat."""
-        cosine = float(np.clip(self.left.normal @ self.right.normal, -1.0, 1.0))
-        return 180.0 - float(np.degrees(np.arccos(cosine)))
-
-
-def measure_groove(points: NDArray[Any]) -> Groove | None:
-    """Find the flanks by their slope along the cloud's rows, and fit a plane to each.
+def measure_groove(points: NDArray[Any]) -> AngleMeasurement | None:
+    """Find the flanks by their slope along the cloud's rows, and the angle of their planes.
 
     Parameters
     ----------
@@ -51,15 +32,16 @@ def measure_groove(points: NDArray[Any]) -> Groove | None:
 
     Returns
     -------
-    Groove or None
-        None when there are no two flanks.
+    AngleMeasurement or None
+        ``first`` is the flank that falls towards larger x, ``second`` the one that rises. None
+        when there are no two flanks.
 
     Examples
     --------
     >>> cloud = np.zeros((50, 400), [("x", "f4"), ("y", "f4"), ("z", "f4")])
     >>> cloud["x"], cloud["y"] = np.linspace(-6e-3, 6e-3, 400), np.linspace(0, 4e-3, 50)[:, None]
     >>> cloud["z"] = np.minimum(0.0, 0.2 * np.abs(cloud["x"]) - 6e-4)
-    >>> round(measure_groove(cloud).included_angle_deg, 2)  # 2 atan(5)
+    >>> round(measure_groove(cloud).value, 2)  # 2 atan(5)
     157.38
     """
     slope = slopes(points)
@@ -70,9 +52,11 @@ def measure_groove(points: NDArray[Any]) -> Groove | None:
     if rising - falling < LEAST_SLOPE_DIFFERENCE:
         return None
     near = NEAR * (rising - falling)
-    left = _flank(points, np.abs(slope - falling) < near)
-    right = _flank(points, np.abs(slope - rising) < near)
-    return Groove(left, right) if left and right else None
+    try:
+        flanks = [select(points, mask=np.abs(slope - s) < near) for s in (falling, rising)]
+        return measure_angle(*flanks)
+    except StackError:
+        return None
 
 
 def slopes(points: NDArray[Any]) -> NDArray[np.float32]:
@@ -81,8 +65,3 @@ def slopes(points: NDArray[Any]) -> NDArray[np.float32]:
     left, right = points[:, : -2 * REACH], points[:, 2 * REACH :]
     slope[:, REACH:-REACH] = (right["z"] - left["z"]) / (right["x"] - left["x"])
     return slope
-
-
-def _flank(points: NDArray[Any], mask: NDArray[np.bool_]) -> Plane | None:
-    chosen = points[mask]
-    return fit_plane(np.stack([chosen[name].astype(np.float64) for name in "xyz"], axis=1))

@@ -1,0 +1,169 @@
+"""Position and diameter of a round hole or dark disc, from edges in the organised cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_projector.errors import StackError
+from sl_reconstruct.height_map import typical_spacing_m
+from sl_reconstruct.measure.region import Region, Selection
+from sl_reconstruct.measure.result import Measurement, uncertainties
+from sl_reconstruct.measure.roughness import crop
+from sl_reconstruct.measure.rounds import fit_rounds
+from sl_reconstruct.plane_fit import TRIM_SD, fit_plane
+
+Array = NDArray[np.float64]
+Method = Literal["intensity", "presence"]
+
+#: A hole's own light over the plate's: points that would tell it are refused as too dark.
+HOLE_LIGHT = (0.0, 0.04)
+#: The edge lies half-way between the plate's light and the hole's.
+EDGE_LEVEL = 0.5 + 0.25 * sum(HOLE_LIGHT)
+U_EDGE_LEVEL = 0.5 * (HOLE_LIGHT[1] - HOLE_LIGHT[0]) / 12**0.5
+#: Edges between two points that are needed to go by the light.
+LEAST_EDGES = 12
+#: Points are refused up to so many spacings beside an edge, as its blur mixes hole and plate.
+REFUSED_SPACINGS = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class HoleMeasurement(Measurement):
+    """A hole; the value is its diameter.
+
+    Parameters
+    ----------
+    centre_m, u_centre_m : tuple of float
+        x, y of the centre and standard uncertainties, metres.
+    method : {"intensity", "presence"}
+        "intensity": edges where the light halves between two neighbouring points. "presence":
+        where points end, with too few of the former; the diameter then is too large by an unknown
+        part of the strip in which points are refused, which is corrected and in its uncertainty.
+    """
+
+    centre_m: tuple[float, float]
+    u_centre_m: tuple[float, float]
+    method: Method
+
+
+def measure_hole(points: NDArray[Any], region: Region) -> HoleMeasurement:
+    """Fit a circle to the edges of the one hole in a region.
+
+    Parameters
+    ----------
+    points : ndarray, (H, K), structured
+        Organised cloud with ``intensity``.
+    region : Region
+        Around the hole, with some plate on all sides and no other hole.
+
+    Raises
+    ------
+    StackError
+        When there is no hole.
+    """
+    cut = crop(points, region)
+    light = _light(cut)
+    edges, blur = crossings(cut, light)
+    method, strip, u_edge = "intensity", 0.0, U_EDGE_LEVEL * blur
+    if len(edges) < LEAST_EDGES or not _on_all_sides(edges):
+        edges, method = _ends(cut), "presence"
+        strip = REFUSED_SPACINGS * typical_spacing_m(cut)
+        u_edge = strip / 12**0.5
+    if len(edges) < LEAST_EDGES:
+        raise StackError(f"{len(edges)} edges in the region; expected a hole with plate around it")
+    flat = Selection(np.column_stack([edges, np.zeros(len(edges))]), np.zeros(len(edges)), region)
+    middle = 0.5 * (edges.min(axis=0) + edges.max(axis=0))
+    start = np.append(middle, np.median(np.hypot(*(edges - middle).T)))
+    values, used, residual, jacobian, _ = fit_rounds(_circle, flat, start)
+    fit = uncertainties(jacobian, residual, flat.sigma_m[used], edges[used])
+    u = np.sqrt(np.diag(fit.covariance))
+    # The strip's width lies somewhere between 0 and `strip`: its middle, and that of a rectangle.
+    return HoleMeasurement(
+        kind="hole", value=float(2.0 * values[2] - strip),
+        uncertainty=float(2.0 * np.hypot(u[2], u_edge)), unit="m",
+        points=int(np.count_nonzero(used)), set_aside=int(np.count_nonzero(~used)),
+        rms_m=fit.rms_m, dof=fit.dof, inflation=fit.inflation, region=region,
+        centre_m=(float(values[0]), float(values[1])), u_centre_m=(float(u[0]), float(u[1])),
+        method="intensity" if method == "intensity" else "presence",
+    )  # fmt: skip
+
+
+def crossings(points: NDArray[Any], light: NDArray[Any]) -> tuple[Array, float]:
+    """Where the light crosses `EDGE_LEVEL` between neighbours that are both there.
+
+    Parameters
+    ----------
+    points : ndarray, (H, K), structured
+        Organised cloud.
+    light : ndarray, (H, K)
+        Light over the plate's.
+
+    Returns
+    -------
+    edges : ndarray, (n, 2)
+        x, y, metres: along a row where the edge faces x, along a column where it faces y, so that
+        no point counts twice.
+    blur_m : float
+        Way along which the light would go from the plate's to none, metres.
+    """
+    found, ways = [], []
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        fa, fb = light[a] - EDGE_LEVEL, light[b] - EDGE_LEVEL
+        crossed = np.isfinite(fa) & np.isfinite(fb) & (fa * fb < 0.0)
+        fall = fa[crossed] - fb[crossed]
+        pa, pb = (np.stack([points[at][crossed][n].astype(np.float64) for n in ("x", "y")], axis=-1)
+                  for at in (a, b))  # fmt: skip
+        found.append(pa + (fa[crossed] / fall)[:, None] * (pb - pa))
+        ways.append(np.hypot(*(pb - pa).T) / np.abs(fall))
+    edges = np.concatenate(found)
+    if not len(edges):
+        return edges, 0.0
+    away = np.abs(edges - 0.5 * (edges.min(axis=0) + edges.max(axis=0)))
+    along_row = np.arange(len(edges)) < len(found[0])
+    kept = along_row == (away[:, 0] > away[:, 1])
+    return edges[kept], float(np.median(np.concatenate(ways)[kept])) if kept.any() else 0.0
+
+
+def _light(points: NDArray[Any]) -> Array:
+    """Light over the plate's, (H, K): 0 where a point lies off the plate, NaN where is none."""
+    there = np.isfinite(points["z"])
+    xyz = np.stack([points[name].astype(np.float64) for name in "xyz"], axis=-1)
+    intensity = np.where(there, points["intensity"], np.nan).astype(np.float64)
+    plate = fit_plane(xyz[there])
+    if plate is None:
+        raise StackError("the plate around the hole has too few points; expected a plane")
+    off = np.abs(plate.distances_m(xyz)) > TRIM_SD * max(plate.rms_m, 1e-9)
+    level = float(np.nanmedian(intensity[there & ~off]))
+    # Only dark points can lie in a hole without being noisy; bright outliers are just outliers.
+    deep = off & (xyz[..., 2] < plate.point_m[2] - 10.0 * TRIM_SD * plate.rms_m)
+    return np.asarray(np.where(deep, 0.0, intensity / level))
+
+
+def _on_all_sides(edges: Array) -> bool:
+    """Whether edges lie on opposite sides, so that they tell a diameter."""
+    width, height = np.ptp(edges, axis=0)
+    return bool(max(width, height) > 0.0 and min(width, height) > 0.2 * max(width, height))
+
+
+def _ends(points: NDArray[Any]) -> Array:
+    """Last points before gaps and first behind them, along rows and columns, (n, 2) metres."""
+    there = np.isfinite(points["z"])
+    found = []
+    for axis in (0, 1):
+        before = np.logical_or.accumulate(there, axis=axis)
+        behind = np.flip(np.logical_or.accumulate(np.flip(there, axis), axis=axis), axis)
+        gap = ~there & before & behind
+        near = np.roll(gap, 1, axis) | np.roll(gap, -1, axis)
+        end = points[there & near]
+        found.append(np.column_stack([end["x"], end["y"]]).astype(np.float64))
+    return np.concatenate(found)
+
+
+def _circle(values: Array, xyz_m: Array) -> tuple[Array, Array, Array]:
+    offset = xyz_m[:, :2] - values[:2]
+    distance = np.hypot(*offset.T)
+    jacobian = np.column_stack([-offset / distance[:, None], -np.ones(len(xyz_m))])
+    return distance - values[2], jacobian, np.zeros(len(xyz_m))

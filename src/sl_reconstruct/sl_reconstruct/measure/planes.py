@@ -1,0 +1,184 @@
+"""Planes, flatness, and the included angle of two planes (the paper's Table 2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_projector.errors import StackError
+from sl_reconstruct.measure.region import Selection
+from sl_reconstruct.measure.result import Measurement, uncertainties
+from sl_reconstruct.plane_fit import TRIM_SD, Plane, fit_plane, robust_sd
+
+Array = NDArray[np.float64]
+
+#: Flatness is taken from means over so many cells along a side: a point alone is mostly noise.
+FLATNESS_CELLS = 40
+#: A cell speaks when it holds this part of what a cell holds usually.
+FULL_CELL = 0.5
+#: Repetitions that tell how noise widens the flatness.
+DRAWS = 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneMeasurement(Measurement):
+    """A plane; the value is its flatness.
+
+    The flatness is the peak-to-valley deviation from the least squares plane (ISO 12781-1, FLTt)
+    of means over `FLATNESS_CELLS` squared cells, less what noise adds to it on average. Where the
+    surface is flatter than the noise of the cells it is an upper bound rather than a value.
+
+    Parameters
+    ----------
+    a, b, c_m : float
+        Z = a X + b Y + c, metres.
+    u_a, u_b, u_c_m : float
+        Their standard uncertainties; ``u_c_m`` is that of the height over the points' centre.
+    normal, point_m : tuple of float
+        Unit normal with z > 0; centre of the points, on the plane.
+    tilts : ndarray, (2, 3), tilt_covariance : ndarray, (2, 2)
+        Two directions in the plane, and the covariance of the plane's slopes along them.
+    """
+
+    a: float
+    b: float
+    c_m: float
+    u_a: float
+    u_b: float
+    u_c_m: float
+    normal: tuple[float, float, float]
+    point_m: tuple[float, float, float]
+    tilts: tuple[tuple[float, ...], ...]
+    tilt_covariance: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AngleMeasurement(Measurement):
+    """Included angle of two planes, degrees; 180 where they are one.
+
+    Parameters
+    ----------
+    first, second : PlaneMeasurement
+        The planes.
+    """
+
+    first: PlaneMeasurement
+    second: PlaneMeasurement
+
+
+def measure_plane(chosen: Selection) -> PlaneMeasurement:
+    """Fit a plane by orthogonal least squares and measure its flatness.
+
+    Parameters
+    ----------
+    chosen : Selection
+        Its points; those off by more than 5 robust standard deviations are set aside.
+
+    Raises
+    ------
+    StackError
+        When there are too few points, or they lie on a line.
+    """
+    plane = fit_plane(chosen.xyz_m)
+    if plane is None:
+        raise StackError(f"{len(chosen)} points make no plane; expected three that are not in line")
+    distance = plane.distances_m(chosen.xyz_m)
+    used = np.abs(distance) <= TRIM_SD * robust_sd(distance)
+    # Points exactly on a plane have no spread; then all are used.
+    used = used if np.count_nonzero(used) > 3 else np.ones(len(chosen), np.bool_)
+    points, distance = chosen.at(used), distance[used]
+    tilts = _tilts(plane.normal)
+    local = (points.xyz_m - plane.point_m) @ tilts.T
+    jacobian = np.column_stack([np.ones(len(points)), local])
+    sigma = points.sigma_m * plane.normal[2]
+    fit = uncertainties(jacobian, distance, sigma, points.xyz_m[:, :2])
+    flatness, u_flatness = _flatness(local, distance, sigma)
+    return PlaneMeasurement(
+        kind="plane", value=flatness, uncertainty=u_flatness, unit="m", points=len(points),
+        set_aside=len(chosen) - len(points), rms_m=fit.rms_m, dof=fit.dof,
+        inflation=fit.inflation, region=chosen.region,
+        normal=_three(plane.normal), point_m=_three(plane.point_m),
+        tilts=tuple(map(tuple, tilts.tolist())),
+        tilt_covariance=tuple(map(tuple, fit.covariance[1:, 1:].tolist())),
+        **_explicit(plane, tilts, fit.covariance),
+    )  # fmt: skip
+
+
+def measure_angle(first: Selection, second: Selection) -> AngleMeasurement:
+    """Included angle of the planes through two sets of points, as in the paper's Table 2.
+
+    Raises
+    ------
+    StackError
+        When one of them makes no plane.
+    """
+    one, two = measure_plane(first), measure_plane(second)
+    n1, n2 = np.array(one.normal), np.array(two.normal)
+    crossed = float(np.linalg.norm(np.cross(n1, n2)))
+    between = float(np.arctan2(crossed, n1 @ n2))
+    variance = 0.0
+    for plane, other in ((one, n2), (two, n1)):
+        # d(angle) = -(other . dn) / sin(angle); where the planes are nearly one, any tilt counts.
+        slopes = np.array(plane.tilts) @ other / crossed if crossed > 1e-9 else np.ones(2)
+        variance += float(slopes @ np.array(plane.tilt_covariance) @ slopes)
+    rms = np.sqrt((one.rms_m**2 * one.points + two.rms_m**2 * two.points)
+                  / (one.points + two.points))  # fmt: skip
+    return AngleMeasurement(
+        kind="angle", value=180.0 - float(np.degrees(between)),
+        uncertainty=float(np.degrees(np.sqrt(variance))), unit="deg",
+        points=one.points + two.points, set_aside=one.set_aside + two.set_aside,
+        rms_m=float(rms), dof=one.dof + two.dof, inflation=max(one.inflation, two.inflation),
+        region=first.region, first=one, second=two,
+    )  # fmt: skip
+
+
+def _tilts(normal: Array) -> Array:
+    """Two unit vectors in the plane, (2, 3)."""
+    along = np.cross(normal, [0.0, 1.0, 0.0] if abs(normal[1]) < 0.9 else [1.0, 0.0, 0.0])
+    along /= np.linalg.norm(along)
+    return np.stack([along, np.cross(normal, along)])
+
+
+def _explicit(plane: Plane, tilts: Array, covariance: Array) -> dict[str, float]:
+    """Z = a X + b Y + c with uncertainties, from the covariance of offset and tilts."""
+    nx, ny, nz = plane.normal
+    x, y, z = plane.point_m
+    a, b = -nx / nz, -ny / nz
+    # A tilt t of slope e turns the normal by -e t; a = -nx / nz changes with it.
+    slopes = np.array([[t[0] / nz - nx * t[2] / nz**2, t[1] / nz - ny * t[2] / nz**2]
+                       for t in tilts]).T  # fmt: skip
+    u_a, u_b = np.sqrt(np.diag(slopes @ covariance[1:, 1:] @ slopes.T))
+    return {
+        "a": float(a), "b": float(b), "c_m": float(z - a * x - b * y), "u_a": float(u_a),
+        "u_b": float(u_b), "u_c_m": float(np.sqrt(covariance[0, 0]) / nz),
+    }  # fmt: skip
+
+
+def _flatness(local_m: Array, distance_m: Array, sigma_m: Array) -> tuple[float, float]:
+    """Peak to valley of cell means less the widening by noise, and its uncertainty.
+
+    The widening is measured by adding the cells' own noise once more (parametric bootstrap).
+    """
+    side = int(np.clip(np.sqrt(len(distance_m) / 9), 1, FLATNESS_CELLS))
+    low, span = local_m.min(axis=0), np.maximum(np.ptp(local_m, axis=0), 1e-30)
+    cell = np.minimum((side * (local_m - low) / span).astype(np.int64), side - 1)
+    number = cell[:, 0] * side + cell[:, 1]
+    count = np.bincount(number)
+    full = count >= FULL_CELL * len(number) / np.count_nonzero(count)
+    mean = np.bincount(number, distance_m)[full] / count[full]
+    variance = sigma_m**2
+    if not variance.any():  # none is stated: the scatter within the cells, form included
+        inside = distance_m - (np.bincount(number, distance_m) / np.maximum(count, 1))[number]
+        variance = inside**2 * len(inside) / max(len(inside) - np.count_nonzero(count), 1)
+    noise = np.sqrt(np.bincount(number, variance)[full]) / count[full]
+    found = float(np.ptp(mean))
+    draws = np.random.default_rng(0).standard_normal((DRAWS, len(mean))) * noise + mean
+    again = np.ptp(draws, axis=1)
+    return max(0.0, 2.0 * found - float(again.mean())), float(again.std())
+
+
+def _three(vector: Array) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in vector)
+    return x, y, z

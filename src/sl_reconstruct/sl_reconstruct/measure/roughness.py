@@ -1,0 +1,201 @@
+"""Areal roughness after ISO 25178-2, computed by surfalize (optional: ``pip install surfalize``).
+
+docs/decisions/0007 says why that library, and which of its parameters are used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_projector.errors import ConfigError, StackError
+from sl_reconstruct.height_map import HeightMap, make_height_map
+from sl_reconstruct.measure.region import Region
+from sl_reconstruct.measure.result import Measurement
+
+Array = NDArray[np.float64]
+
+#: Height parameters in metres, and those without unit (Sdr as a ratio, not percent).
+LENGTHS = ("Sa", "Sq", "Sp", "Sv", "Sz")
+NUMBERS = ("Ssk", "Sku", "Sdr", "Sdq")
+#: Repetitions of the points' noise, each with both signs, that tell bias and uncertainty.
+PAIRS = 16
+MICROMETRE_M = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoughnessMeasurement(Measurement):
+    """Areal parameters; the value is Sq.
+
+    Parameters
+    ----------
+    raw : dict of str to float
+        Parameters as the height map has them: what any program finds in it. Metres for Sa, Sq,
+        Sp, Sv and Sz, numbers for Ssk, Sku, Sdr and Sdq.
+    corrected, uncertainties : dict of str to float
+        The same less what the points' stated noise adds, and standard uncertainties.
+    step_m : float
+        Distance of the map's nodes, metres.
+    """
+
+    raw: dict[str, float]
+    corrected: dict[str, float]
+    uncertainties: dict[str, float]
+    step_m: float
+
+
+def measure_roughness(
+    points: NDArray[Any], region: Region | None = None, step_m: float | None = None
+) -> RoughnessMeasurement:
+    """Roughness of a region, a plane taken out (F-operation), no further filter.
+
+    Parameters
+    ----------
+    points : ndarray, (H, K), structured
+        Organised cloud; ``sigma`` where known.
+    region : Region, optional
+        Everywhere when left out; the largest full rectangle of nodes inside counts.
+    step_m : float, optional
+        Distance of the map's nodes, metres; the points' typical spacing when left out.
+
+    Raises
+    ------
+    ConfigError
+        When surfalize is not installed.
+    StackError
+        When the region holds too few points.
+
+    Notes
+    -----
+    The points' noise adds to every parameter. It is drawn again from the stated sigmas, put
+    through the same map, and what it adds is taken off (parametric bootstrap); Sz, Sp and Sv keep
+    some of it. Points without sigma give no uncertainty (NaN).
+    """
+    cut = crop(points, region)
+    height = make_height_map(cut, step_m)
+    raw = areal_parameters(height.z_m, height.step_m)
+    drawn = _again(cut, height, raw)
+    bias = {name: float(np.mean(values)) - raw[name] for name, values in drawn.items()}
+    spread = {name: float(np.std(values, ddof=1)) for name, values in drawn.items()}
+    corrected = {name: _less(name, raw[name], bias[name]) for name in raw}
+    count = int(np.count_nonzero(np.isfinite(height.z_m)))
+    return RoughnessMeasurement(
+        kind="roughness", value=corrected["Sq"], uncertainty=spread["Sq"], unit="m",
+        points=int(np.count_nonzero(np.isfinite(cut["z"]))), set_aside=0, rms_m=raw["Sq"],
+        dof=count - 3, inflation=1.0, region=region, raw=raw, corrected=corrected,
+        uncertainties=spread, step_m=height.step_m,
+    )  # fmt: skip
+
+
+def areal_parameters(z_m: NDArray[Any], step_m: float) -> dict[str, float]:
+    """Parameters of a height map after levelling by the least squares plane.
+
+    Parameters
+    ----------
+    z_m : ndarray, (rows, columns)
+        Heights, metres. Borders with NaN are cut off; a NaN within is filled from its nearest node.
+    step_m : float
+        Distance of nodes, metres.
+
+    Returns
+    -------
+    dict of str to float
+        Metres for Sa, Sq, Sp, Sv and Sz, numbers for Ssk, Sku, Sdr and Sdq.
+
+    Raises
+    ------
+    ConfigError, StackError
+        Without surfalize; with fewer than 3 x 3 nodes.
+    """
+    try:
+        from surfalize import Surface
+    except ImportError:
+        raise ConfigError(
+            "roughness needs surfalize, which is not installed; expected: pip install surfalize"
+        ) from None
+    inner = _without_border(np.asarray(z_m, dtype=np.float64))
+    step_um = step_m / MICROMETRE_M
+    surface = Surface(inner / MICROMETRE_M, step_um, step_um)
+    if not np.isfinite(inner).all():
+        surface = surface.fill_nonmeasured()
+    surface = surface.level()
+    found = {name: float(getattr(surface, name)()) for name in LENGTHS + NUMBERS}
+    return {
+        **{name: found[name] * MICROMETRE_M for name in LENGTHS},
+        **{name: found[name] for name in NUMBERS},
+        "Sdr": found["Sdr"] / 100.0,
+    }
+
+
+def crop(points: NDArray[Any], region: Region | None) -> NDArray[Any]:
+    """Smallest rows and columns of an organised cloud that hold a region; NaN outside it.
+
+    Raises
+    ------
+    StackError
+        When the cloud is not organised, or has no points there.
+    """
+    if points.ndim != 2 or min(points.shape) < 2:
+        raise StackError(
+            f"a cloud of shape {points.shape}; expected an organised one (rows, columns), "
+            "such as cloud.pcd or height.tiff"
+        )
+    inside = np.isfinite(points["z"])
+    if region is not None:
+        inside &= region.contains(points["x"], points["y"])
+    if not inside.any():
+        raise StackError("no points in the region; expected some")
+    rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+    window = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    cut = points[window].copy()
+    cut["z"][~inside[window]] = np.nan
+    return np.asarray(cut)
+
+
+def _without_border(z: Array) -> Array:
+    """Cut off outer rows and columns that are less than nine tenths full."""
+    there = np.isfinite(z)
+    while min(z.shape) >= 3:
+        sides = [there[0], there[-1], there[:, 0], there[:, -1]]
+        full = [float(side.mean()) for side in sides]
+        worst = int(np.argmin(full))
+        if full[worst] >= 0.9:
+            return z
+        top, bottom, left, right = (int(worst == side) for side in range(4))
+        rows, columns = z.shape
+        z = z[top : rows - bottom, left : columns - right]
+        there = there[top : rows - bottom, left : columns - right]
+    raise StackError("too few heights for roughness; expected a region of at least 3 x 3 nodes")
+
+
+def _again(
+    points: NDArray[Any], height: HeightMap, raw: dict[str, float]
+) -> dict[str, list[float]]:
+    """Parameters with the points' noise added once more, many times."""
+    names = points.dtype.names or ()
+    sigma = points["sigma"] if "sigma" in names else np.zeros(points.shape, np.float32)
+    if not np.nanmax(np.where(np.isfinite(points["z"]), sigma, 0.0), initial=0.0) > 0.0:
+        return {name: [float("nan")] * 2 for name in raw}
+    rng = np.random.default_rng(0)
+    drawn: dict[str, list[float]] = {name: [] for name in raw}
+    for _ in range(PAIRS):
+        noise = sigma * rng.standard_normal(points.shape, np.float32)
+        for signed in (noise, -noise):
+            noisy = points.copy()
+            noisy["z"] += signed
+            found = areal_parameters(make_height_map(noisy, height.step_m).z_m, height.step_m)
+            for name, value in found.items():
+                drawn[name].append(value)
+    return drawn
+
+
+def _less(name: str, raw: float, bias: float) -> float:
+    """Take off what noise adds: variances add, so in squares, but for Sdr and the shapes."""
+    if np.isnan(bias):
+        return raw
+    if name in ("Ssk", "Sku", "Sdr"):
+        return raw - bias
+    return float(np.sqrt(max(0.0, 2.0 * raw**2 - (raw + bias) ** 2)))
