@@ -134,7 +134,8 @@ class WiredPair:
     """A projector and a camera on its trigger line, looking at a scene.
 
     ``drop`` says for each run (from 0) which frames get lost, ``swap`` which neighbours come with
-    each other's content, as after a mix-up of buffers that no number betrays.
+    each other's content, as after a mix-up of buffers that no number betrays, ``white`` which frame
+    is saturated all over, ``twice`` which frames a doubled trigger gives twice.
     """
 
     def __init__(self, render: Callable[[PatternSequence], np.ndarray]) -> None:
@@ -142,6 +143,8 @@ class WiredPair:
         self.camera = FakeCamera()
         self.drop: dict[int, set[int]] = {}
         self.swap: dict[int, int] = {}
+        self.white: dict[int, int] = {}
+        self.twice: dict[int, set[int]] = {}
         self.runs = 0
         self._render = render
 
@@ -151,11 +154,14 @@ class WiredPair:
         if run in self.swap:
             i = self.swap[run]
             images[[i, i + 1]] = images[[i + 1, i]]
+        if run in self.white:
+            images[self.white[run]] = 255
         for index, image in enumerate(images):
             if index in self.drop.get(run, set()):
                 continue
             stamp_ns = info.start_ns + round(index * info.timing.period_s * 1e9)
-            self.camera.frames.put(Frame(image, index + 1, stamp_ns, 0.001, FrameStatus.OK))
+            for _ in range(1 + (index in self.twice.get(run, set()))):
+                self.camera.frames.put(Frame(image, index + 1, stamp_ns, 0.001, FrameStatus.OK))
 
 
 class FakeStage:

@@ -713,6 +713,28 @@ def test_exchanged_content_never_becomes_a_cloud(rig: Rig) -> None:
     assert len(rig.clouds) == 1
 
 
+def test_a_doubled_trigger_repeats_the_scan(rig: Rig) -> None:
+    rig.pair.twice = {0: {7}}
+    answer = rig.scan()
+    rig.pair.twice = {}
+    rig.expect_good(answer)
+    assert answer.report.attempts == 2
+    assert "twice" in answer.report.attempt_messages[0]
+
+
+@pytest.mark.parametrize("index", [0, 1, 3, 12])
+def test_a_frame_that_is_white_all_over_never_becomes_wrong_points(rig: Rig, index: int) -> None:
+    """White, black, a code and a fine pattern: refused, or the points that are left are right."""
+    rig.pair.white = {0: index}
+    answer = rig.scan(max_repeats=0)
+    rig.pair.white = {}
+    if answer.success:
+        assert_plane(wait(lambda: rig.clouds and rig.clouds[0], "the cloud"))
+    else:
+        assert answer.message
+    rig.expect_good(rig.scan())
+
+
 def test_a_scan_that_is_always_spoilt_is_refused_with_its_reason(rig: Rig) -> None:
     rig.pair.drop = {run: {0} for run in range(9)}
     answer = rig.scan(max_repeats=1)
