@@ -15,7 +15,7 @@ ros_graph.require_ros()
 from sensor_msgs.msg import Image  # noqa: E402
 from sl_interfaces.msg import PatternTrigger  # noqa: E402
 
-from camera_bench import fake_gige, gvcp_port, require_gi  # noqa: E402
+from camera_bench import fake_gige, gige_bench, gvcp_port, require_gi  # noqa: E402
 from ros_graph import wait  # noqa: E402
 from sl_bench.bench import Bench  # noqa: E402
 from sl_bench.bench_settings import BenchSettings  # noqa: E402
@@ -66,6 +66,41 @@ def test_two_hundred_software_triggered_frames_through_the_node_without_loss() -
         values = node.health().values
         assert (values["frames"], values["frames lost"], values["frames incomplete"]) == (200, 0, 0)
         assert values["times lost"] == 0
+
+
+def test_packet_loss_and_an_unplugged_cable_are_told_and_over_when_they_are_over() -> None:
+    mirrors = np.ones((2, 2), np.bool_)
+    with gige_bench() as (emulator, gige), ros_graph.graph() as graph:
+        node = graph.add(CameraNode, address="aravis:127.0.0.1", exposure_s=0.003)
+        images = graph.collect(Image, "camera/image_raw", IMAGES)
+        wait(lambda: node.health().level == "ok", "the camera")
+
+        def edges(count: int) -> None:
+            for i in range(count):
+                emulator.on_exposure(mirrors, i, time.time_ns(), 0.01)
+                time.sleep(0.01)
+
+        edges(5)
+        wait(lambda: len(images) == 5, "five images")
+        gige.stream.lose, gige.stream.resend = 1.0, False
+        edges(2)
+        gige.stream.lose = 0.0
+        time.sleep(0.3)
+        edges(1)
+        wait(lambda: len(images) == 6, "the frame after the loss")
+        wait(lambda: node._link.device().statistics().lost == 2, "the loss to be counted")
+        health = node.health()
+        assert (health.level, health.values["frames lost"]) == ("warn", 2)
+        assert "2 frames lost" in health.message
+        assert node.health().level == "ok"  # told once
+
+        gige.disconnect(1.0)
+        wait(lambda: node.health().level == "error", "the loss to be told", 20.0)
+        assert "gone" in node.health().message
+        wait(lambda: node.health().level == "ok", "the camera to be back", 20.0)
+        edges(3)
+        wait(lambda: len(images) == 9, "images again")
+        assert node.health().values["times lost"] >= 1
 
 
 def run_scan(projector: Dlpc900, camera: AravisCamera, scan_id: int) -> list[FrameDecision]:
