@@ -27,6 +27,7 @@ COMMANDS: tuple[tuple[str, str, str], ...] = (
     ("record", "sl_bringup.record", "record what an evaluation needs"),
     ("replay", "sl_bringup.replay", "publish a recording as the devices did"),
     ("evaluate", "sl_bringup.evaluate", "recordings to clouds, reports and pictures"),
+    ("measure", "sl_bringup.measure", "measure a cloud: planes, angles, steps, roughness, ..."),
 )
 
 OVERVIEW = "\n".join(f"  {name:<10} {line}" for name, _, line in COMMANDS)

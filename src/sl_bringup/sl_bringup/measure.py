@@ -1,0 +1,290 @@
+"""``slrig measure``: measurements of a cloud or height map, with uncertainty and verdict."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_bringup.progress import say
+from sl_bringup.report import write_json
+from sl_projector.errors import ConfigError, StackError
+from sl_reconstruct.cloud_reading import read_cloud, read_height_map
+from sl_reconstruct.height_map import make_height_map
+from sl_reconstruct.measure.deviation import map_reference, measure_deviation
+from sl_reconstruct.measure.groove import measure_groove
+from sl_reconstruct.measure.hole import measure_hole
+from sl_reconstruct.measure.planes import PlaneMeasurement, measure_angle, measure_plane
+from sl_reconstruct.measure.profile import ProfileMeasurement, measure_profile, save_profile
+from sl_reconstruct.measure.region import Region, select
+from sl_reconstruct.measure.result import Measurement, Tolerance
+from sl_reconstruct.measure.roughness import RoughnessMeasurement, measure_roughness
+from sl_reconstruct.measure.rounds import measure_cylinder, measure_sphere
+from sl_reconstruct.measure.step import measure_step
+from sl_reconstruct.measure.x3p import save_x3p
+
+MILLIMETRE_M, MICROMETRE_M = 1e-3, 1e-6
+#: Width of the strip that a section averages, as a part of its length.
+SECTION_WIDTH = 0.01
+#: Measurements told in millimetres; other lengths are told in micrometres.
+IN_MILLIMETRES = ("sphere", "cylinder", "hole")
+
+Points = NDArray[Any]
+Numbers = tuple[float, ...]
+
+
+class Feature(NamedTuple):
+    """An option of the command: what it measures from the numbers behind it (metres)."""
+
+    help: str
+    metavar: str
+    measure: Callable[[Points, Numbers], Measurement]
+
+
+def _angle(points: Points, numbers: Numbers) -> Measurement:
+    if len(numbers) != 8:
+        raise ConfigError(f"--angle with {len(numbers)} numbers; expected two rectangles, so 8")
+    first, second = Region.of(numbers[:4]), Region.of(numbers[4:])
+    return measure_angle(select(points, first), select(points, second))
+
+
+def _groove(points: Points, numbers: Numbers) -> Measurement:
+    if points.ndim != 2:
+        raise StackError("--groove needs an organised cloud; expected cloud.pcd or height.tiff")
+    found = measure_groove(points)
+    if found is None:
+        raise StackError("no groove found; expected two flanks of different slope")
+    return found
+
+
+def _profile(points: Points, numbers: Numbers) -> Measurement:
+    if len(numbers) not in (4, 5):
+        raise ConfigError(f"--profile with {len(numbers)} numbers; expected X0,Y0,X1,Y1[,WIDTH]")
+    x0, y0, x1, y1 = numbers[:4]
+    width = numbers[4] if len(numbers) == 5 else SECTION_WIDTH * math.hypot(x1 - x0, y1 - y0)
+    return measure_profile(points, (x0, y0), (x1, y1), width)
+
+
+RECTANGLE = "X0,Y0,X1,Y1"
+FEATURES: dict[str, Feature] = {
+    "plane": Feature("plane and its flatness", RECTANGLE,
+                     lambda p, n: measure_plane(select(p, Region.of(n)))),
+    "angle": Feature("included angle of two planes", "RECTANGLE,RECTANGLE", _angle),
+    "groove": Feature("included angle of a groove whose flanks are found", "", _groove),
+    "step": Feature("height of a step across x, ISO 5436-1", RECTANGLE,
+                    lambda p, n: measure_step(select(p, Region.of(n)))),
+    "step-y": Feature("height of a step across y", RECTANGLE,
+                      lambda p, n: measure_step(select(p, Region.of(n)), "y")),
+    "sphere": Feature("radius and centre of a sphere", RECTANGLE,
+                      lambda p, n: measure_sphere(select(p, Region.of(n)))),
+    "cylinder": Feature("radius and axis of a cylinder", RECTANGLE,
+                        lambda p, n: measure_cylinder(select(p, Region.of(n)))),
+    "hole": Feature("centre and diameter of the hole in a region", RECTANGLE,
+                    lambda p, n: measure_hole(p, Region.of(n))),
+    "roughness": Feature("areal roughness, ISO 25178", RECTANGLE,
+                         lambda p, n: measure_roughness(p, Region.of(n))),
+    "profile": Feature("section along a line; see --csv", "X0,Y0,X1,Y1[,WIDTH]", _profile),
+}  # fmt: skip
+
+
+def numbers_of(text: str) -> Numbers:
+    """Numbers separated by commas, millimetres, as metres.
+
+    Examples
+    --------
+    >>> numbers_of("1,-2.5")
+    (0.001, -0.0025)
+    """
+    try:
+        return tuple(MILLIMETRE_M * float(word) for word in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}; expected numbers like 0,0,2,1.5") from None
+
+
+def tolerance_of(text: str) -> Tolerance:
+    """``LOW:HIGH``, either may be left out."""
+    low, colon, high = text.partition(":")
+    try:
+        limits = float(low or -math.inf), float(high or math.inf)
+        if colon:
+            return Tolerance(*limits)
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"{text!r}; expected LOW:HIGH with LOW < HIGH")
+
+
+def add_parser(subparsers: Any) -> None:
+    """Register ``slrig measure``."""
+    parser = subparsers.add_parser(
+        "measure",
+        help="measure a cloud or height map",
+        description="Measure features of a cloud or height map, each with its standard "
+        "uncertainty. Regions are in millimetres, as the axes of the pictures: X0,Y0,X1,Y1 or "
+        "the corners of a polygon. Write --plane=-1,-1,1,1 where the first number is negative.",
+        epilog="examples:\n"
+        "  slrig measure output/groove/cloud.pcd --groove --tolerance 155.9:155.95\n"
+        "  slrig measure cloud.pcd --angle=-2.5,-3,-0.5,3,0.5,-3,2.5,3 --json angle.json\n"
+        "  slrig measure cloud.pcd --profile=-5,0,5,0,0.1 --csv section.csv\n"
+        "exit status: 0 only when everything was measured and lies within its tolerance",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "cloud", type=Path, metavar="CLOUD|TIFF",
+        help="cloud.pcd, cloud.ply, or height.tiff with its report.json",
+    )  # fmt: skip
+    for name, feature in FEATURES.items():
+        if feature.metavar:
+            parser.add_argument(
+                f"--{name}", type=numbers_of, metavar=feature.metavar, help=feature.help
+            )
+        else:
+            parser.add_argument(f"--{name}", action="store_const", const=(), help=feature.help)
+    parser.add_argument(
+        "--reference", type=Path, metavar="TIFF",
+        help="compare with this height map (report.json beside it)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--level", action="store_true", help="take offset and tilt out of the comparison"
+    )
+    parser.add_argument(
+        "--tolerance", type=tolerance_of, metavar="LOW:HIGH",
+        help="limits of the value, in the unit in which it is told; one measurement only",
+    )  # fmt: skip
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all results")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write the section's points")
+    parser.add_argument("--x3p", type=Path, metavar="FILE", help="write the height map as X3P")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out ``slrig measure``."""
+    wanted = _wanted(args)
+    if not wanted and args.x3p is None:
+        raise ConfigError(f"nothing to measure; expected one of --{', --'.join(FEATURES)}, --x3p")
+    if args.tolerance is not None and len(wanted) != 1:
+        raise ConfigError(f"--tolerance with {len(wanted)} measurements; expected one")
+    if args.csv is not None and args.profile is None:
+        raise ConfigError("--csv writes a section; expected --profile as well")
+    points = read_cloud(args.cloud)
+    verdicts, results = [], []
+    for measure in wanted:
+        found = measure(points)
+        verdict = _verdict(found, args.tolerance)
+        for line in lines(found):
+            say(line)
+        if verdict:
+            say(f"{'tolerance':<18}{verdict}")
+        verdicts.append(verdict)
+        results.append({**_plain(found.to_dict()), "verdict": verdict or None})
+        if isinstance(found, ProfileMeasurement) and args.csv is not None:
+            save_profile(args.csv, found)
+    if args.x3p is not None:
+        _write_x3p(args.x3p, points)
+    if args.json is not None:
+        write_json(args.json, {"format": 1, "cloud": str(args.cloud), "measurements": results})
+    return 0 if all(verdict in ("", "pass") for verdict in verdicts) else 1
+
+
+def _wanted(args: argparse.Namespace) -> list[Callable[[Points], Measurement]]:
+    """What the options ask for, in the order of the table."""
+    wanted: list[Callable[[Points], Measurement]] = []
+    for name, feature in FEATURES.items():
+        numbers = getattr(args, name.replace("-", "_"))
+        if numbers is not None:
+            wanted.append(lambda p, f=feature, n=numbers: f.measure(p, n))  # type: ignore[misc]
+    if args.reference is not None:
+        reference = map_reference(read_height_map(args.reference))
+        wanted.append(lambda p: measure_deviation(p, reference, level=args.level))
+    return wanted
+
+
+def _write_x3p(path: Path, points: Points) -> None:
+    if points.ndim != 2:
+        raise StackError("--x3p needs an organised cloud; expected cloud.pcd or height.tiff")
+    save_x3p(path, make_height_map(points))
+
+
+def told(found: Measurement) -> tuple[float, str]:
+    """Units that a value is told in per its own, and their name."""
+    if found.unit != "m":
+        return 1.0, {"deg": "degrees"}.get(found.unit, "")
+    if found.kind in IN_MILLIMETRES:
+        return 1.0 / MILLIMETRE_M, "mm"
+    return 1.0 / MICROMETRE_M, "µm"
+
+
+def _verdict(found: Measurement, tolerance: Tolerance | None) -> str:
+    factor, _ = told(found)
+    if tolerance is None:
+        return ""
+    return tolerance.verdict(factor * found.value, factor * found.uncertainty)
+
+
+def lines(found: Measurement) -> Iterator[str]:
+    """Lines that tell a person what was measured."""
+    factor, unit = told(found)
+    names = {"plane": "flatness", "deviation": "mean deviation", "roughness": "Sq",
+             "angle": "included angle", "hole": "diameter", "profile": "height of section",
+             "sphere": "radius", "cylinder": "radius", "step": "step height"}  # fmt: skip
+    yield (
+        f"{names[found.kind]:<18}{_rounded(factor * found.value, factor * found.uncertainty)} "
+        f"{unit} (standard uncertainty)"
+    )
+    aside = f", {found.set_aside:,} set aside" if found.set_aside else ""
+    shared = (
+        f", shared errors enlarge it {found.inflation:.2f} times" if found.inflation > 1 else ""
+    )
+    yield (
+        f"{'  from':<18}{found.points:,} points{aside}, residuals "
+        f"{found.rms_m / MICROMETRE_M:.4g} µm rms{shared}"
+    )
+    yield from _details(found)
+
+
+def _details(found: Measurement) -> Iterator[str]:
+    if isinstance(found, PlaneMeasurement):
+        yield (
+            f"{'  plane':<18}Z = {found.a:+.6f} X {found.b:+.6f} Y {1e3 * found.c_m:+.6f} mm, "
+            f"uncertainties {found.u_a:.2g}, {found.u_b:.2g}, {1e3 * found.u_c_m:.2g} mm"
+        )
+    for name in ("first", "second"):
+        plane = getattr(found, name, None)
+        if plane is not None:
+            yield from _details(plane)
+    centre = getattr(found, "centre_m", None)
+    if centre is not None:
+        both = zip(centre, getattr(found, "u_centre_m", centre), strict=True)
+        yield f"{'  centre':<18}({', '.join(_rounded(1e3 * c, 1e3 * u) for c, u in both)}) mm"
+    if isinstance(found, RoughnessMeasurement):
+        for name, value in found.corrected.items():
+            length = name in ("Sa", "Sq", "Sp", "Sv", "Sz")
+            factor, unit = (1e6, " µm") if length else (1.0, "")
+            own, raw = factor * found.uncertainties[name], factor * found.raw[name]
+            yield f"  {name:<16}{_rounded(factor * value, own)}{unit} (with the noise {raw:.5g})"
+
+
+def _rounded(value: float, u: float) -> str:
+    """Value and uncertainty, the latter with two digits, the former to the same place.
+
+    Examples
+    --------
+    >>> _rounded(155.920213, 0.000123), _rounded(12.5, float("nan"))
+    ('155.92021 ± 0.00012', '12.5')
+    """
+    if not (math.isfinite(u) and u > 0.0 and math.isfinite(value)):
+        return f"{value:.6g}"
+    places = max(0, 1 - math.floor(math.log10(u)))
+    return f"{value:.{places}f} ± {u:.{places}f}"
+
+
+def _plain(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave maps of whole clouds out of what goes to JSON."""
+    return {
+        key: value for key, value in content.items()
+        if not (isinstance(value, np.ndarray) and value.ndim > 1)
+    }  # fmt: skip
