@@ -18,7 +18,7 @@ _MARKS = {"ok": "ok  ", "note": "note", "bad": "BAD "}
 def examine(options: GraphOptions) -> list[Finding]:
     """Check everything; a check that fails by itself is a finding too."""
     on_devices: list[Callable[[], list[Finding]]] = [
-        lambda: checks.projector(bench=options.bench),
+        lambda: checks.projector(options.source, bench=options.bench),
         lambda: checks.serial_ports(options.source, bench=options.bench),
         lambda: checks.camera(options.source, bench=options.bench),
     ]

@@ -26,6 +26,7 @@ from sl_bringup.transport import (
 from sl_camera.aravis_library import INSTALL as ARAVIS_INSTALL
 from sl_camera.aravis_library import find_camera, list_cameras, load_aravis
 from sl_camera.camera_drivers import make_camera
+from sl_projector.dmd import DEFAULT_MODEL, MODELS
 from sl_projector.errors import DeviceLost, SlError
 
 PYTHON_RANGE = ((3, 11), (3, 13))
@@ -35,10 +36,11 @@ LIBRARIES = {
     "yaml": "PyYAML", "usb.core": "pyusb", "serial": "pyserial", "rosbags": "rosbags",
     "matplotlib": "matplotlib", "plyfile": "plyfile",
 }  # fmt: skip
-DLPC900_ID = (0x0451, 0xC900)
+#: USB vendor and product of each controller.
+CONTROLLER_IDS = {"DLPC900": (0x0451, 0xC900), "DLPC350": (0x0451, 0x6401)}
 UDEV_FILE = Path("/etc/udev/rules.d/70-slrig.rules")
 UDEV_RULE = (
-    'SUBSYSTEM=="usb", ATTRS{idVendor}=="0451", ATTRS{idProduct}=="c900", '
+    'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="0451", ATTRS{{idProduct}}=="{product:04x}", '
     'MODE="0660", GROUP="plugdev", TAG+="uaccess"'
 )
 INSTALL = "make venv"
@@ -185,24 +187,29 @@ def _calibration(file: str) -> Finding:
     return Finding("ok", "calibration", f"{file} ({calibration.hash[:12]})")
 
 
-def projector(bench: bool) -> list[Finding]:
-    """The DLPC900 on the USB, and the permission to use it."""
+def projector(source: Path, bench: bool) -> list[Finding]:
+    """The projector's controller on the USB, and the permission to use it."""
     if bench:
         return []
     import usb.core
 
+    dmd = _parameter(source, "projector", "dmd_model") or DEFAULT_MODEL
+    chip = MODELS[dmd].controller if dmd in MODELS else MODELS[DEFAULT_MODEL].controller
+    vendor, product = CONTROLLER_IDS[chip]
     try:
-        device = usb.core.find(idVendor=DLPC900_ID[0], idProduct=DLPC900_ID[1])
+        device = usb.core.find(idVendor=vendor, idProduct=product)
     except usb.core.NoBackendError:
         return [Finding("bad", "projector", "no libusb", "apt install libusb-1.0-0")]
     if device is None:
         remedy = "plug it in and switch it on; without hardware: --bench"
-        return [Finding("bad", "projector", "no DLPC900 (0451:c900) on the USB", remedy)]
+        text = f"no {chip} ({vendor:04x}:{product:04x}) on the USB"
+        return [Finding("bad", "projector", text, remedy)]
     node = Path(f"/dev/bus/usb/{device.bus:03d}/{device.address:03d}")
     if not os.access(node, os.R_OK | os.W_OK):
-        remedy = f"echo '{UDEV_RULE}' | sudo tee {UDEV_FILE}; sudo udevadm control --reload; replug"
+        rule = UDEV_RULE.format(product=product)
+        remedy = f"echo '{rule}' | sudo tee {UDEV_FILE}; sudo udevadm control --reload; replug"
         return [Finding("bad", "projector", f"no permission for {node}", remedy)]
-    return [Finding("ok", "projector", f"DLPC900 at {node}")]
+    return [Finding("ok", "projector", f"{chip} at {node}")]
 
 
 def _parameter(source: Path, node: str, name: str) -> str:
