@@ -63,8 +63,8 @@ class LiveResults:
                         "cloud_hash": message.cloud_hash}  # fmt: skip
         last = live[-1]
         found: dict[str, Any] = {"agrees": None, "cloud_hash": last.cloud_hash}
-        for what in ("calibration", "settings"):
+        for what, told in (("calibration", "another calibration"), ("settings", "other settings")):
             if getattr(last, f"{what}_hash") != report[f"{what}_hash"]:
-                return {**found, "told": f"the live cloud was made with another {what}"}
+                return {**found, "told": f"the live cloud was made with {told}"}
         told = "the live cloud differs, though calibration and settings are the same"
         return {**found, "agrees": False, "told": told}
