@@ -17,6 +17,7 @@ import ros_graph
 
 ros_graph.require_ros()
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from rclpy.action import ActionClient  # noqa: E402
 from sl_interfaces.action import Calibrate as CalibrateAction  # noqa: E402
 from sl_interfaces.msg import RigCalibration  # noqa: E402
@@ -54,7 +55,9 @@ class Running:
 
     def calibrate(self, **request: object) -> Calibrate.Response:
         # The first call may wait for the compiler.
-        return self.graph.call(Calibrate, "calibration/calibrate", Calibrate.Request(**request), 250)
+        return self.graph.call(
+            Calibrate, "calibration/calibrate", Calibrate.Request(**request), 250
+        )
 
     def height_m(self) -> float:
         with BenchControl(self.directory) as bench:
@@ -84,12 +87,25 @@ def start(directory: Path, domain: int) -> dict[str, subprocess.Popen[bytes]]:
     return processes
 
 
+def await_devices(graph: Graph) -> None:
+    """Wait until every node has said of itself that it is well."""
+    said: list[DiagnosticArray] = []
+    graph.tester.create_subscription(DiagnosticArray, "/diagnostics", said.append, 50)
+
+    def ready() -> bool:
+        levels = {s.name.partition(":")[0]: s.level for array in said for s in array.status}
+        return all(levels.get(name) == DiagnosticStatus.OK for name in NODES)
+
+    wait(ready, "the devices", 60.0)
+
+
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     directory = tmp_path_factory.mktemp("graph")
     with ros_graph.graph() as graph:
         processes = start(directory, graph.domain)
         try:
+            await_devices(graph)
             yield Running(graph, directory, processes)
         finally:
             for process in processes.values():

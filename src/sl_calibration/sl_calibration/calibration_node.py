@@ -25,6 +25,7 @@ from sl_calibration.plate import Plate
 from sl_calibration.session import Order, Progress
 from sl_calibration.store import Store, default_directory
 from sl_calibration.uncertainty import Limits
+from sl_calibration.warm_up import warm_up_apart
 from sl_projector.base_node import (
     CAMERA_FRAME,
     LATCHED,
@@ -66,6 +67,7 @@ class CalibrationNode(RigNode):
         self.subscribe(RigCalibration, "calibration/rig", self._on_rig, LATCHED)
         self._load()
         self._offer()
+        self._compiler = warm_up_apart()
 
     def _offer(self) -> None:
         group = self.long_work
@@ -207,6 +209,8 @@ class CalibrationNode(RigNode):
     def close(self) -> None:
         """End; a run that is going on is cancelled, since the context is gone."""
         self._action.destroy()
+        self._compiler.terminate()
+        self._compiler.wait()
         super().close()
 
     # -- calibrate --------------------------------------------------------------------------------
@@ -241,6 +245,7 @@ class CalibrationNode(RigNode):
     ) -> Outcome:
         def work() -> Outcome:
             order = self._order(request)
+            self._await_compiler(cancelled)
             with self._gear.in_use(cancelled) as gear:
                 return self._calibrator.calibrate(gear, order, self._in_force, tell)
 
@@ -248,6 +253,11 @@ class CalibrationNode(RigNode):
         if outcome.success and outcome.calibration is not None:
             self._put_in_force(outcome.calibration, outcome.calibration_file, time.time_ns())
         return outcome
+
+    def _await_compiler(self, cancelled: Callable[[], bool]) -> None:
+        """Let the first start on a machine compile once, not twice at the same time."""
+        while self._compiler.poll() is None and not cancelled():
+            time.sleep(0.05)
 
     def _alone(self, work: Callable[[], Any], failed: Callable[..., Any]) -> Any:
         """Do one run at a time; what goes wrong is its answer."""
@@ -299,6 +309,7 @@ class CalibrationNode(RigNode):
             sequence = str(self._value("sequence"))
             if self._in_force is None:
                 raise CalibrationError(f"nothing to verify: {self._fault}")
+            self._await_compiler(self._shutting_down)
             with self._gear.in_use(self._shutting_down) as gear:
                 return self._calibrator.verify(
                     gear, request.target or "plate", plate, sequence, self._in_force

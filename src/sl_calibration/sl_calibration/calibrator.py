@@ -28,8 +28,8 @@ from sl_calibration.session import (
 )
 from sl_calibration.solution import RigSolution, metres_per_pixel, solve_rig
 from sl_calibration.store import CALIBRATION, OBSERVATIONS, PAGE, Store
-from sl_calibration.uncertainty import EdgeNoise, Limits, Verdict, judge, sigma_map
-from sl_calibration.verify import Check, check_rig_on
+from sl_calibration.uncertainty import EdgeNoise, Limits, Verdict, Volume, judge, sigma_map
+from sl_calibration.verify import Check, check_rig_on, triangulate
 from sl_calibration.views import Observations, View, load_observations, save_observations
 from sl_projector.errors import CalibrationError, SlError
 from sl_reconstruct.calibration_file import Calibration, save_calibration
@@ -94,9 +94,14 @@ class Solved:
         return EdgeNoise(float(np.median(edges))) if edges else EdgeNoise()
 
     @property
+    def volume(self) -> Volume:
+        """Box of everything that the projector lit and the camera saw."""
+        return lit_volume(self.solution)
+
+    @property
     def predicted_sigma_m(self) -> float:
         """Predicted 1-sigma of a point's z, edge noise included, worst in the volume."""
-        sigma = sigma_map(self.solution.joint, self.solution.volume, self.edge_noise)[1]
+        sigma = sigma_map(self.solution.joint, self.volume, self.edge_noise)[1]
         return float(np.nanmax(sigma[..., 2]))
 
     @property
@@ -250,8 +255,21 @@ def solve(observations: Observations, limits: Limits) -> Solved:
     camera = Sensor(observations.camera_size, observations.camera_pitch_m)
     projector = Sensor(observations.dmd_size, observations.dmd_pitch_m)
     solution = solve_rig(holes, targets, camera, projector, _freedom(observations.made_from))
-    verdict = judge(solution.figures(), limits)
+    verdict = judge(solution.figures(lit_volume(solution)), limits)
     return Solved(observations, solution, verdict, limits, time.perf_counter() - began_s)
+
+
+def lit_volume(solution: RigSolution) -> Volume:
+    """Box of the triangulated targets, without the outermost that may be wrong."""
+    joint = solution.joint
+    used = joint.used[joint.problem.groups[1]]
+    data = joint.problem.targets
+    points, _ = triangulate(solution.rig, data.camera_px[used], data.pixels[used])
+    low, high = np.quantile(points, (0.002, 0.998), axis=0)
+    return Volume(
+        (float(low[0]), float(low[1]), float(low[2])),
+        (float(high[0]), float(high[1]), float(high[2])),
+    )
 
 
 def _stage(view: View) -> Any:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sl_calibration.solution import metres_per_pixel
-from sl_calibration.uncertainty import sigma_map
+from sl_calibration.uncertainty import EdgeNoise, sigma_map
 
 if TYPE_CHECKING:
     from sl_calibration.calibrator import Solved
@@ -141,8 +141,8 @@ def uncertainty(solved: Solved) -> Figure:
     """Maps of sigma z at the lowest, the middle and the highest height: calibration, with noise."""
     solution = solved.solution
     figure = _figure(11, 5.6)
-    from_calibration = sigma_map(solution.joint, solution.volume, type(solved.edge_noise)(0.0))
-    with_noise = sigma_map(solution.joint, solution.volume, solved.edge_noise)
+    from_calibration = sigma_map(solution.joint, solved.volume, EdgeNoise(0.0))
+    with_noise = sigma_map(solution.joint, solved.volume, solved.edge_noise)
     rows = ((from_calibration, "calibration"), (with_noise, "calibration and edge noise"))
     for line, ((grid, sigma), name) in zip(figure.subplots(2, 3), rows, strict=True):
         z_um = sigma[..., 2] * _UM
