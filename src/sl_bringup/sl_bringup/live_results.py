@@ -66,5 +66,5 @@ class LiveResults:
         for what, told in (("calibration", "another calibration"), ("settings", "other settings")):
             if getattr(last, f"{what}_hash") != report[f"{what}_hash"]:
                 return {**found, "told": f"the live cloud was made with {told}"}
-        told = "the live cloud differs, though calibration and settings are the same"
+        told = "the live cloud differs, with the same calibration and settings (other software?)"
         return {**found, "agrees": False, "told": told}
