@@ -53,8 +53,9 @@ class Tuning(NamedTuple):
     """What survey and settings say, in pixels, DMD pixels and DN.
 
     ``direction``: +1 where k grows with u, -1 where it falls. ``reach_px``: beyond it an edge's
-    blur does not matter. ``around_px``: a fine stripe's half width. ``scale``: camera pixels per DMD pixel. ``floor_dn``: keeps quotients
-    finite. ``least_width``, ``most_width``: of an edge, over what is expected. ``noise_dn2``, ``noise_dn``: variance = noise_dn2 + noise_dn * level.
+    blur does not matter. ``around_px``: a fine stripe's half width. ``scale``: camera pixels per
+    DMD pixel. ``floor_dn``: keeps quotients finite. ``least_width``, ``most_width``: of an edge,
+    over what is expected. ``noise_dn2``, ``noise_dn``: variance = noise_dn2 + noise_dn * level.
     ``jump_px``: a centre may lie so far from where the edges on a side lead.
     """
 
@@ -254,9 +255,7 @@ def identify(
     is none on the DMD. ``flip`` exchanges the polarities.
     """
     at, ks, agreed, filtered = r.at, r.k, r.agreed, r.filtered
-    period, tolerance = 4.0 * half, max(
-        0.5 * t.division_px + 1.5, min(0.9 * half, MISREAD_PX)
-    )
+    period, tolerance = 4.0 * half, max(0.5 * t.division_px + 1.5, min(0.9 * half, MISREAD_PX))
     most = 2.5 * (2 * t.reach_px + 1) / t.scale + t.division_px
     last, turn = code.size - 1, flip != (t.direction < 0)
     for i in range(count):
@@ -289,7 +288,7 @@ def pair_variance(total: float, gain: Any, i: int, plateau: float, t: Tuning) ->
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def single_variance(
     threshold_dn: float, light_dn: float, bright: int, dark: int, level_dn: float, t: Tuning
-) -> float:
+) -> Any:
     """Variance of a single image's samples about ``level_dn``, and of their threshold, DN^2.
 
     The threshold is the middle between the means of so many bright and dark samples.

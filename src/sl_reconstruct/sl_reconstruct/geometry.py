@@ -82,10 +82,8 @@ def optics(device: Device) -> Optics:
         model, lens = DIVISION, [device.lens.kappa, 0, 0, 0, 0]
     else:
         model, lens = BROWN_CONRADY, list(device.lens.coefficients)
-    return Optics(
-        model, *map(float, device.focal_length_px), *map(float, device.image_centre_px),
-        np.array(lens, dtype=float),
-    )  # fmt: skip
+    (fx, fy), (cu, cv) = device.focal_length_px, device.image_centre_px
+    return Optics(model, float(fx), float(fy), float(cu), float(cv), np.array(lens, dtype=float))
 
 
 def geometry(rig: Rig) -> Geometry:

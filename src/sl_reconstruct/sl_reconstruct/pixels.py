@@ -26,8 +26,9 @@ class PixelRow(NamedTuple):
     ``middle``: integer threshold between them. ``light``: bright minus dark, DN.
     ``threshold``: sub-DN threshold, NaN where unknown (dynamic only). ``bright``, ``dark``:
     clean samples (dynamic only), their sum in the low bits and their count above.
-    ``ratio``: dark over bright level. ``bit``, ``clean``, ``parity``: a bit plane, where it is far from its edges, and the running
-    parity. ``code``: division number. ``lit``: 1 where lit; ``clipped``: 1 where saturated.
+    ``ratio``: dark over bright level. ``bit``, ``clean``, ``parity``: a bit plane, where it is
+    far from its edges, and the running parity. ``code``: division number. ``lit``: 1
+    where lit; ``clipped``: 1 where saturated.
     """
 
     low: NDArray[Any]
@@ -49,7 +50,18 @@ class PixelRow(NamedTuple):
 def pixel_row(width: int, dtype: Any) -> PixelRow:
     """Return scratch for rows of ``width`` pixels of a stack of type ``dtype``."""
     sums = np.uint16 if dtype == np.uint8 else np.uint32
-    types = [dtype, dtype, dtype, np.float32, np.float32, np.float32, sums, sums, np.uint8, np.uint8]
+    types = [
+        dtype,
+        dtype,
+        dtype,
+        np.float32,
+        np.float32,
+        np.float32,
+        sums,
+        sums,
+        np.uint8,
+        np.uint8,
+    ]
     types += [np.uint8, np.uint16, np.uint8, np.uint8]
     return PixelRow(*(np.zeros(width, t) for t in types))
 
@@ -236,7 +248,7 @@ def set_masks(p: PixelRow, lit_dn: float, saturation: int) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def sample_count(sums: Any, x: int) -> int:
+def sample_count(sums: Any, x: int) -> Any:
     """Number of clean samples behind a pixel's sum, at least 1."""
     shift = COUNT_SHIFT_8 if sums.itemsize == 2 else COUNT_SHIFT_16
     return max(1, sums[x] >> shift)

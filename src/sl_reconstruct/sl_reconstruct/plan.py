@@ -6,6 +6,7 @@ Everything the decoder knows about the patterns is derived here from the sequenc
 from __future__ import annotations
 
 from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,7 +47,7 @@ class Source:
 
     def edge_at(self, boundaries: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which of the boundaries are edges of this source."""
-        return (boundaries - self.rising_px) % (2 * self.half_period_px) == 0
+        return np.asarray((boundaries - self.rising_px) % (2 * self.half_period_px) == 0)
 
     def centre_at(self, boundaries: NDArray[np.int64], size_px: int) -> NDArray[np.bool_]:
         """Which of the boundaries are centres of stripes whose both edges are on the DMD."""
@@ -175,7 +176,8 @@ def _paired(sequence: PatternSequence, axis: Axis) -> list[tuple[Pattern, int, i
     for i, p in enumerate(sequence.patterns):
         if p.kind == "gray" and p.axis == axis:
             index.setdefault(p, i)
-    found, used = [], set()
+    found: list[tuple[Pattern, int, int]] = []
+    used: set[Pattern] = set()
     for p, i in index.items():
         if p in used:
             continue
@@ -188,7 +190,8 @@ def _paired(sequence: PatternSequence, axis: Axis) -> list[tuple[Pattern, int, i
 def _code_bits(patterns: list[tuple[Pattern, int, int]], name: str) -> tuple[list[CodeBit], int]:
     """The unshifted bits from the coarsest on, and the width of their divisions."""
     by_bit = {p.bit: (p, i, n) for p, i, n in patterns if p.shift_px == 0}
-    bits, division_px = [], 0
+    bits: list[CodeBit] = []
+    division_px = 0
     while len(bits) in by_bit:
         p, i, n = by_bit[len(bits)]
         bits.append(CodeBit(i, n, p.inverted))
@@ -222,8 +225,10 @@ def _sources(patterns: list[tuple[Pattern, int, int]], size_px: int) -> list[Sou
             continue
         covered |= s.edge_at(k)
         chosen.append(s)
-        last_single = not s.paired and s.half_period_px == finest and (
-            i + 1 == len(candidates) or candidates[i + 1].half_period_px > finest
+        last_single = (
+            not s.paired
+            and s.half_period_px == finest
+            and (i + 1 == len(candidates) or candidates[i + 1].half_period_px > finest)
         )
         if last_single:
             chosen = _with_centres(chosen, covered, k, size_px, finest)
@@ -231,7 +236,11 @@ def _sources(patterns: list[tuple[Pattern, int, int]], size_px: int) -> list[Sou
 
 
 def _with_centres(
-    chosen: list[Source], covered: NDArray[np.bool_], k: NDArray[np.int64], size_px: int, finest: int
+    chosen: list[Source],
+    covered: NDArray[np.bool_],
+    k: NDArray[np.int64],
+    size_px: int,
+    finest: int,
 ) -> list[Source]:
     out = []
     for s in chosen:
@@ -247,9 +256,7 @@ def _axis_plan(sequence: PatternSequence, axis: Axis) -> AxisPlan:
     size_px = sequence.dmd_size[0 if axis == "column" else 1]
     patterns = _paired(sequence, axis)
     bits, division_px = _code_bits(patterns, sequence.name)
-    images = tuple(
-        i for i, p in enumerate(sequence.patterns) if p.kind != "gray" or p.axis == axis
-    )
+    images = tuple(i for i, p in enumerate(sequence.patterns) if p.kind != "gray" or p.axis == axis)
     sources = tuple(_sources(patterns, size_px))
     unlit = _unlit([sequence.patterns[i] for i in images], size_px)
     return AxisPlan(axis, size_px, tuple(bits), division_px, images, sources, unlit)
@@ -261,5 +268,5 @@ def _unlit(patterns: list[Pattern], size_px: int) -> tuple[int, ...]:
     for p in patterns:
         padded = np.pad(p.profile(size_px), MARGIN_PX)
         windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * MARGIN_PX)
-        out &= ~windows.all(axis=1)[:size_px]
+        out &= ~np.asarray(windows.all(axis=1))[:size_px]
     return tuple(int(k) for k in np.flatnonzero(out))

@@ -107,7 +107,7 @@ def _lonely(u: Any, s: Screen, bad: Any) -> None:
     n = u.size
     sign, near = 1.0 if s.near_px > 0 else -1.0, abs(s.near_px)
     for k in range(n):
-        if bad[k] or not u[k] == u[k]:
+        if bad[k] or np.isnan(u[k]):
             continue
         left = k >= 2 and u[k - 1] + u[k - 2] == u[k - 1] + u[k - 2]
         right = k < n - 2 and u[k + 1] + u[k + 2] == u[k + 1] + u[k + 2]
@@ -147,9 +147,7 @@ def find_steps(u_px: Any, y: int, s: Screen, bad: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _row(
-    g: Geometry, y: int, columns: Any, lines: Any, bad: Any, r: Rays, out: Output
-) -> None:
+def _row(g: Geometry, y: int, columns: Any, lines: Any, bad: Any, r: Rays, out: Output) -> None:
     u, reason, values = out.u_px[y], out.reason[y], out.values[y]
     found, sigma_px, level = lines.reason[y], lines.sigma_px[y], lines.level_dn[y]
     for k in range(u.size):

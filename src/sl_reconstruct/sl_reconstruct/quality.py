@@ -162,5 +162,3 @@ def check_phase(u_px: NDArray[np.float32], owner: NDArray[np.int64], images: lis
                 f"middle of their neighbours; expected at most {MAX_PHASE}: images are exchanged "
                 f"or repeated"
             )
-
-

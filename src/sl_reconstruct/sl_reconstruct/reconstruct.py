@@ -23,8 +23,16 @@ from sl_reconstruct.quality import check_identity, check_order, check_phase
 from sl_reconstruct.rig import Rig
 from sl_reconstruct.rows import Layout, Lines, decode_rows, row_scratch
 from sl_reconstruct.settings import Settings
+from sl_reconstruct.survey import (
+    NOISE_STEP,
+    Noise,
+    code_growth,
+    edge_bound,
+    fit_noise,
+    sample_scatter,
+    survey_rows,
+)
 from sl_reconstruct.workers import share_rows
-from sl_reconstruct.survey import NOISE_STEP, Noise, code_growth, fit_noise, sample_scatter, survey_rows
 
 #: Blur assumed until it is measured, camera pixels.
 FIRST_BLUR_PX = 1.0
@@ -46,6 +54,7 @@ class AxisState(NamedTuple):
     bars: bool
     blur_px: float
     noise: Noise
+    bound_px: float
 
 
 class Reconstructor:
@@ -119,9 +128,9 @@ class Reconstructor:
 
     def _reconstruct(self, stack: NDArray[Any]) -> Cloud:
         column = self.plan.column
-        state, lines, figures = self._decode(stack, column, self.plan.white, self.plan.black)
+        _, lines, figures = self._decode(stack, column, self.plan.white, self.plan.black)
         out = _output(*lines.u_px.shape)
-        columns = np.arange(column.size_px) - 0.5
+        columns = np.arange(column.size_px, dtype=np.float64) - 0.5
         screen = _screen(self.settings, figures)
 
         def work(first: int, last: int) -> None:
@@ -177,16 +186,18 @@ class Reconstructor:
         check_identity(lines.tally, images)
         check_phase(lines.u_px[ys], layout.edge_owner, images)
         order = check_order(lines.u_px[ys])
-        return state, lines, figures_of(state, lines, ys, order)
+        return state, lines, figures_of(state, layout, lines, ys, order)
 
     def _lines(self, key: tuple[Any, ...]) -> Lines:
         """Scratch for so many rows of an axis, made once."""
         if key not in self._scratch:
             rows, plan = key[0], key[1]
-            shape = (rows, plan.size_px)
+            u_px, sigma_px, width_px, level_dn = np.full(
+                (4, rows, plan.size_px), np.nan, np.float32
+            )
             self._scratch[key] = Lines(
-                *(np.full(shape, np.nan, np.float32) for _ in range(4)),
-                np.ones(shape, np.uint8), np.zeros((rows, len(plan.sources), 2), np.int32),
+                u_px, sigma_px, width_px, level_dn, np.ones((rows, plan.size_px), np.uint8),
+                np.zeros((rows, len(plan.sources), 2), np.int32),
             )  # fmt: skip
         return self._scratch[key]
 
@@ -243,10 +254,12 @@ def first_tuning(plan: AxisPlan, settings: Settings, full_scale: int) -> Tuning:
     """What is known before a look at the images."""
     contrast_dn = settings.min_contrast_dn or 0.03 * full_scale
     return Tuning(
-        1, int(np.ceil(REACH_SD * FIRST_BLUR_PX)), 4 * plan.division_px, 1.0, plan.division_px, plan.size_px,
-        0.002 * full_scale, 0.5 * contrast_dn, contrast_dn,
-        settings.saturation_dn or full_scale, 0.0, np.inf, settings.min_light, 0.0, 0.0,
-        settings.max_jump_px,
+        direction=1, reach_px=int(np.ceil(REACH_SD * FIRST_BLUR_PX)),
+        around_px=4 * plan.division_px, scale=1.0, division_px=plan.division_px,
+        size_px=plan.size_px, floor_dn=0.002 * full_scale, lit_dn=0.5 * contrast_dn,
+        contrast_dn=contrast_dn, saturation=settings.saturation_dn or full_scale,
+        least_width=0.0, most_width=np.inf, min_light=settings.min_light,
+        noise_dn2=0.0, noise_dn=0.0, jump_px=settings.max_jump_px,
     )  # fmt: skip
 
 
@@ -260,7 +273,8 @@ def survey(
     growth, _ = code_growth(stack, ys, layout, tuning, scratch.pixels)
     if not abs(growth) > 0:
         growth = 1.0
-    noise = fit_noise(sample_scatter(stack, ys[::NOISE_STEP], layout, tuning, scratch.pixels))
+    scatter = sample_scatter(stack, ys[::NOISE_STEP], layout, tuning, scratch.pixels)
+    noise = fit_noise(scatter)
     tuning = tuning._replace(
         direction=1 if growth > 0 else -1, scale=1 / abs(growth),
         noise_dn2=noise.read_dn2, noise_dn=noise.shot_dn,
@@ -278,7 +292,7 @@ def survey(
     matched = settings.estimator == "matched"
     filters = edge_filter(plan, matched, blur_px, tuning.scale)
     bars = not matched and bool(filters.slope[-1] > MIN_BAR_SLOPE)
-    return AxisState(tuning, filters, bars, blur_px, noise)
+    return AxisState(tuning, filters, bars, blur_px, noise, edge_bound(scatter, noise, blur_px))
 
 
 def measure_scale(lines: Lines, guess: float) -> float:
@@ -302,14 +316,16 @@ def measure_blur(lines: Lines, plan: AxisPlan, layout: Layout, scale: float) -> 
 
 
 def figures_of(
-    state: AxisState, lines: Lines, ys: NDArray[np.int64], order: float
+    state: AxisState, layout: Layout, lines: Lines, ys: NDArray[np.int64], order: float
 ) -> Figures:
     """Quality figures from the surveyed rows."""
     t = state.tuning
-    present = lines.reason[ys] == 0
-    sigma = lines.sigma_px[ys][present]
+    edges = layout.edge_owner >= 0
+    sigma = lines.sigma_px[ys][:, edges][lines.reason[ys][:, edges] == 0]
+    pairs = 1.0 if layout.dynamic else np.sqrt(2.0)
     return Figures(
         edge_blur_px=state.blur_px, scale_px=t.scale * t.direction,
         noise_read_dn2=state.noise.read_dn2, noise_shot_dn=state.noise.shot_dn,
-        edge_sigma_px=float(np.median(sigma)) if sigma.size else float("nan"), order=order,
+        edge_sigma_px=float(np.median(sigma)) if sigma.size else float("nan"),
+        edge_bound_px=float(state.bound_px / pairs), order=order,
     )  # fmt: skip

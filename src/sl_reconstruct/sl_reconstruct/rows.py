@@ -127,7 +127,7 @@ def _settle(
     u_px, sigma_px, width_px, reasons = out.u_px, out.sigma_px, out.width_px, out.reason
     accepted = confused = 0
     for i in range(count):
-        k, reason = np.int64(ks[i]), np.int64(why[i])
+        k, reason = int(ks[i]), int(why[i])
         shaped = (
             (width[i] >= least) & (width[i] <= most) & (fraction[i] >= -0.5) & (fraction[i] <= 1.5)
         )
@@ -153,7 +153,8 @@ def _edges(
     r: SourceRow, out: Found, tally: Any,
 ) -> None:  # fmt: skip
     """Find and identify the edges of one source."""
-    count = find_crossings(p.lit, r, 1, r.filtered.size - 2)
+    margin = f.taps.shape[1] + t.reach_px  # neither filter nor threshold reach beyond the image
+    count = find_crossings(p.lit, r, margin, r.filtered.size - margin - 1)
     find_zeros(r.filtered, r.at, count, r.fraction, r.slope)
     identify(p.code, r, count, plan.sources[s, 3], plan.sources[s, 2], False, t)
     check_light(p.light, p.clipped, r.at, count, t, r.why)
@@ -169,7 +170,8 @@ def _bars(
     s: int, plan: Layout, f: Filter, t: Tuning, p: PixelRow, r: SourceRow, out: Found, tally: Any
 ) -> None:
     """Find and identify the centres of one source by BR8's zero crossings, Eq. (6)."""
-    count = find_crossings(p.lit, r, 5, r.filtered.size - 6)
+    margin = 5 + t.reach_px
+    count = find_crossings(p.lit, r, margin, r.filtered.size - margin - 1)
     find_zeros(r.filtered, r.at, count, r.fraction, r.slope)
     half = plan.sources[s, 2]
     # left of a bright centre the left samples are the darker ones, whichever way k grows
@@ -289,7 +291,7 @@ def _see(p: PixelRow, seen: Any, blind: Any) -> None:
         if not lit[x]:
             gap += clipped[x]
             continue
-        q = np.int64(code[x])
+        q = int(code[x])
         if q >= seen.size:
             continue
         seen[q] += 1

@@ -49,7 +49,7 @@ def code_growth(stack: Any, ys: Any, plan: Layout, t: Tuning, p: PixelRow) -> An
     for y in ys:
         decode_pixels(stack, y, plan, t, p)
         for x in range(p.code.size - LAG_PX):
-            a, b = np.int64(p.code[x]), np.int64(p.code[x + LAG_PX])
+            a, b = int(p.code[x]), int(p.code[x + LAG_PX])
             known = p.lit[x] and p.lit[x + LAG_PX] and max(a, b) < divisions
             if known and abs(b - a) * t.division_px <= 4 * LAG_PX:
                 total += (b - a) * t.division_px
@@ -124,3 +124,17 @@ def _bin_mean(part: Array) -> tuple[float, float, float]:
     good = part[part[:, 1] <= limit]
     freedom = good[:, 2] - 1
     return float(good[:, 0].mean()), float(np.average(good[:, 1], weights=freedom)), freedom.sum()
+
+
+def edge_bound(scatter: Array, noise: Noise, blur_px: float) -> float:
+    """Least standard deviation of an edge's position from one image, px (docs, design: noise).
+
+    ``(sigma / A) sqrt(2 sqrt(pi) s)`` with the height A of a step between the median dark and
+    bright level, blurred to s, and the noise sigma half-way up. NaN where it is not known.
+    """
+    dark, bright = (part[part[..., 2] > 0][:, 0] for part in np.moveaxis(scatter, 1, 0))
+    if not (dark.size and bright.size and noise.read_dn2 >= 0):
+        return float("nan")
+    low, high = float(np.median(dark)), float(np.median(bright))
+    sigma = np.sqrt(noise.variance((low + high) / 2))
+    return float(sigma / (high - low) * np.sqrt(2 * np.sqrt(np.pi) * blur_px))
