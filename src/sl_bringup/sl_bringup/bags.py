@@ -352,9 +352,9 @@ def _open_directory(bag: Bag, path: Path, stack: ExitStack) -> list[_File]:
 
 
 def _fast(bag: Bag, storage: Any, stack: ExitStack) -> _Storage:
-    return (
-        _open_mcap(bag, Path(str(storage.path)), stack) if isinstance(storage, McapReader) else storage
-    )
+    if isinstance(storage, McapReader):
+        return _open_mcap(bag, Path(str(storage.path)), stack)
+    return storage  # type: ignore[no-any-return]
 
 
 def _open_mcap(bag: Bag, path: Path, stack: ExitStack) -> McapFile:

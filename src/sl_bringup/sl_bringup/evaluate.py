@@ -12,7 +12,15 @@ from typing import Any
 
 from sl_bringup.bags import open_bag
 from sl_bringup.choices import parse_choices
-from sl_bringup.evaluation import Choices, Crew, Pictures, Result, count_scans, evaluate_bag, is_good
+from sl_bringup.evaluation import (
+    Choices,
+    Crew,
+    Pictures,
+    Result,
+    count_scans,
+    evaluate_bag,
+    is_good,
+)
 from sl_bringup.progress import Progress, complain, say
 from sl_bringup.result_folder import live_line
 from sl_bringup.sweep import Variant, variants, write_sweep
