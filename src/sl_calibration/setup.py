@@ -26,8 +26,5 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},
     zip_safe=False,
-    entry_points={
-        "console_scripts": ["calibration_node = sl_calibration.calibration_node:main"],
-    },
     entry_points={"console_scripts": [f"{n} = {NAME}.{n}:main" for n in NODES]},
 )
