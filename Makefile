@@ -16,7 +16,7 @@ PYTEST := $(BIN)/python -m pytest
 
 export MYPYPATH := $(subst $() ,:,$(foreach p,$(PACKAGES),src/$(p)))
 
-.PHONY: help scan test check bench venv clean distclean
+.PHONY: help scan test check paper bench venv clean distclean
 .DEFAULT_GOAL := help
 
 help: ## this text
@@ -33,6 +33,9 @@ check: venv ## style, types, import directions: under a minute
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy $(SOURCES)
 	@$(PYTEST) -q tests/test_architecture.py
+
+paper: venv ## the paper's Table 2 and Figs. 10 and 11 on the bench, beside the paper's numbers
+	@$(BIN)/python -m sl_bringup.paper --output $(OUTPUT)/paper
 
 bench: venv ## speed and memory
 	@set -e; for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b; done

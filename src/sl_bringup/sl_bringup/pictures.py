@@ -64,7 +64,7 @@ def relief_picture(height: HeightMap, title: str) -> bytes:
     axes.imshow(
         np.where(there, shade, np.nan), cmap="gray", vmin=0, vmax=1, extent=_extent_mm(height)
     )
-    return _png(figure)
+    return png(figure)
 
 
 def profile_picture(points: NDArray[Any], title: str) -> bytes:
@@ -85,7 +85,7 @@ def profile_picture(points: NDArray[Any], title: str) -> bytes:
     z_m, sigma_m = line["z"].astype(np.float64), line["sigma"].astype(np.float64)
     unit, factor = _unit(z_m)
     sigma_unit, sigma_factor = _unit(sigma_m)
-    x_mm, z_m, sigma_m = _broken_at_gaps(x_mm, z_m, sigma_m)
+    x_mm, z_m, sigma_m = broken_at_gaps(x_mm, z_m, sigma_m)
     figure = Figure(figsize=(9, 6), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     above.fill_between(
@@ -99,7 +99,7 @@ def profile_picture(points: NDArray[Any], title: str) -> bytes:
     below.set(xlabel="x / mm", ylabel=f"2 sigma of z / {sigma_unit}", ylim=(0, None))
     for axes in (above, below):
         axes.grid(True, alpha=0.3)
-    return _png(figure)
+    return png(figure)
 
 
 def refusal_picture(
@@ -135,7 +135,7 @@ def refusal_picture(
     shown = [(name, colour) for name, colour in entries if counts.get(name)]
     handles = [Patch(color=colour, label=f"{name}: {counts[name]:,}") for name, colour in shown]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
-    return _png(figure)
+    return png(figure)
 
 
 def _enlarged(reasons: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -182,7 +182,7 @@ def _map(
     )  # fmt: skip
     bar = figure.colorbar(image, ax=axes, extend="both", shrink=0.9)
     bar.set_label(f"{label} / {unit}")
-    return _png(figure)
+    return png(figure)
 
 
 def _map_axes(height: HeightMap, title: str) -> tuple[Figure, Any]:
@@ -217,7 +217,7 @@ def _fullest_middle_row(points: NDArray[Any]) -> int:
     return int(best[np.argmin(np.abs(best - rows / 2))])
 
 
-def _broken_at_gaps(x: NDArray[Any], *values: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+def broken_at_gaps(x: NDArray[Any], *values: NDArray[Any]) -> tuple[NDArray[Any], ...]:
     """Put a NaN wherever the points are far apart, so that no line bridges a gap."""
     apart = np.diff(x)
     if not apart.size:
@@ -226,7 +226,8 @@ def _broken_at_gaps(x: NDArray[Any], *values: NDArray[Any]) -> tuple[NDArray[Any
     return tuple(np.insert(v.astype(np.float64), gaps, np.nan) for v in (x, *values))
 
 
-def _png(figure: Figure) -> bytes:
+def png(figure: Figure) -> bytes:
+    """PNG of a figure, drawn without a display."""
     buffer = io.BytesIO()
     FigureCanvasAgg(figure)
     figure.savefig(buffer, format="png", pil_kwargs={"compress_level": 4})

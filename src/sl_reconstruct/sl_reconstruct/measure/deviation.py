@@ -14,7 +14,7 @@ from sl_projector.errors import StackError
 from sl_reconstruct.height_map import HeightMap
 from sl_reconstruct.measure.region import Region, select
 from sl_reconstruct.measure.result import Measurement, uncertainties
-from sl_reconstruct.plane_fit import TRIM_SD, robust_sd
+from sl_reconstruct.measure.trimmed import trimmed_fit
 
 Array = NDArray[np.float64]
 #: Heights (n,) of the reference at x, y (n,), metres; NaN where it has none.
@@ -72,11 +72,9 @@ def measure_deviation(
     chosen = select(points, region, over)
     inside = over if region is None else over & region.contains(points["x"], points["y"])
     found = deviation[inside]
-    spread = max(TRIM_SD * robust_sd(found - np.median(found)), 1e-15)
-    used = np.abs(found - np.median(found)) <= spread
-    kept, found = chosen.at(used), found[used]
-    design = _design(kept.xyz_m, level)
-    plane = np.linalg.lstsq(design, found, rcond=None)[0]
+    design = _design(chosen.xyz_m, level)
+    plane, used = trimmed_fit(design, found)
+    kept, found, design = chosen.at(used), found[used], design[used]
     residual = found - design @ plane
     fit = uncertainties(design, residual, kept.sigma_m, kept.xyz_m[:, :2])
     if level:

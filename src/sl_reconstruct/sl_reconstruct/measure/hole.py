@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sl_projector.errors import StackError
 from sl_reconstruct.height_map import typical_spacing_m
 from sl_reconstruct.measure.region import Region, Selection
-from sl_reconstruct.measure.result import Measurement, uncertainties
+from sl_reconstruct.measure.result import Fitted, Measurement, uncertainties
 from sl_reconstruct.measure.roughness import crop
 from sl_reconstruct.measure.rounds import fit_rounds
 from sl_reconstruct.plane_fit import TRIM_SD, fit_plane
@@ -25,7 +25,7 @@ HOLE_LIGHT = (0.0, 0.04)
 EDGE_LEVEL = 0.5 + 0.25 * sum(HOLE_LIGHT)
 U_EDGE_LEVEL = 0.5 * (HOLE_LIGHT[1] - HOLE_LIGHT[0]) / 12**0.5
 #: Edges between two points that are needed to go by the light.
-LEAST_EDGES = 12
+LEAST_EDGES = 8
 #: Points are refused up to so many spacings beside an edge, as its blur mixes hole and plate.
 REFUSED_SPACINGS = 3.0
 
@@ -67,18 +67,16 @@ def measure_hole(points: NDArray[Any], region: Region) -> HoleMeasurement:
     cut = crop(points, region)
     light = _light(cut)
     edges, blur = crossings(cut, light)
-    method, strip, u_edge = "intensity", 0.0, U_EDGE_LEVEL * blur
-    if len(edges) < LEAST_EDGES or not _on_all_sides(edges):
+    method: Method = "intensity"
+    strip, u_edge = 0.0, U_EDGE_LEVEL * blur
+    values, used, fit = _round(edges, region)
+    if not _within(values, edges):
         edges, method = _ends(cut), "presence"
         strip = REFUSED_SPACINGS * typical_spacing_m(cut)
         u_edge = strip / 12**0.5
-    if len(edges) < LEAST_EDGES:
+        values, used, fit = _round(edges, region)
+    if fit is None:
         raise StackError(f"{len(edges)} edges in the region; expected a hole with plate around it")
-    flat = Selection(np.column_stack([edges, np.zeros(len(edges))]), np.zeros(len(edges)), region)
-    middle = 0.5 * (edges.min(axis=0) + edges.max(axis=0))
-    start = np.append(middle, np.median(np.hypot(*(edges - middle).T)))
-    values, used, residual, jacobian, _ = fit_rounds(_circle, flat, start)
-    fit = uncertainties(jacobian, residual, flat.sigma_m[used], edges[used])
     u = np.sqrt(np.diag(fit.covariance))
     # The strip's width lies somewhere between 0 and `strip`: its middle, and that of a rectangle.
     return HoleMeasurement(
@@ -87,7 +85,7 @@ def measure_hole(points: NDArray[Any], region: Region) -> HoleMeasurement:
         points=int(np.count_nonzero(used)), set_aside=int(np.count_nonzero(~used)),
         rms_m=fit.rms_m, dof=fit.dof, inflation=fit.inflation, region=region,
         centre_m=(float(values[0]), float(values[1])), u_centre_m=(float(u[0]), float(u[1])),
-        method="intensity" if method == "intensity" else "presence",
+        method=method,
     )  # fmt: skip
 
 
@@ -124,7 +122,9 @@ def crossings(points: NDArray[Any], light: NDArray[Any]) -> tuple[Array, float]:
     away = np.abs(edges - 0.5 * (edges.min(axis=0) + edges.max(axis=0)))
     along_row = np.arange(len(edges)) < len(found[0])
     kept = along_row == (away[:, 0] > away[:, 1])
-    return edges[kept], float(np.median(np.concatenate(ways)[kept])) if kept.any() else 0.0
+    # Secants are flatter than the edge at its middle: the steep quarter is nearest to it.
+    steep = np.quantile(np.concatenate(ways)[kept], 0.25) if kept.any() else 0.0
+    return edges[kept], float(steep)
 
 
 def _light(points: NDArray[Any]) -> Array:
@@ -142,10 +142,23 @@ def _light(points: NDArray[Any]) -> Array:
     return np.asarray(np.where(deep, 0.0, intensity / level))
 
 
-def _on_all_sides(edges: Array) -> bool:
-    """Whether edges lie on opposite sides, so that they tell a diameter."""
-    width, height = np.ptp(edges, axis=0)
-    return bool(max(width, height) > 0.0 and min(width, height) > 0.2 * max(width, height))
+def _round(edges: Array, region: Region) -> tuple[Array, NDArray[np.bool_], Fitted | None]:
+    """Circle (x, y, radius), edges used and what they tell; no fit where there are too few."""
+    if len(edges) < LEAST_EDGES:
+        return np.full(3, np.nan), np.zeros(len(edges), np.bool_), None
+    flat = Selection(np.column_stack([edges, np.zeros(len(edges))]), np.zeros(len(edges)), region)
+    middle = 0.5 * (edges.min(axis=0) + edges.max(axis=0))
+    start = np.append(middle, np.median(np.hypot(*(edges - middle).T)))
+    values, used, residual, jacobian, _ = fit_rounds(_circle, flat, start)
+    return values, used, uncertainties(jacobian, residual, flat.sigma_m[used], edges[used])
+
+
+def _within(values: Array, edges: Array) -> bool:
+    """Whether a circle's centre lies among its edges, so that they tell a diameter."""
+    if not np.isfinite(values).all():
+        return False
+    low, high = edges.min(axis=0), edges.max(axis=0)
+    return bool(((values[:2] > low) & (values[:2] < high)).all())
 
 
 def _ends(points: NDArray[Any]) -> Array:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sl_projector.errors import ConfigError, StackError
 from sl_reconstruct.measure.region import Selection
 from sl_reconstruct.measure.result import Measurement, uncertainties
+from sl_reconstruct.measure.trimmed import trimmed_fit
 from sl_reconstruct.plane_fit import TRIM_SD, robust_sd
 
 Array = NDArray[np.float64]
@@ -19,7 +20,6 @@ Axis = Literal["x", "y"]
 
 #: Walls are looked for among medians of so many slices across the step.
 SLICES = 300
-ROUNDS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,9 +81,9 @@ def measure_step(
             )
     points = chosen.at(on | before | behind)
     delta = on[on | before | behind].astype(np.float64)
-    used, centre, found = _fit(points, delta)
-    points, delta = points.at(used), delta[used]
-    jacobian = _design(points, delta, centre)
+    design = _design(points, delta)
+    found, used = trimmed_fit(design, points.xyz_m[:, 2])
+    points, jacobian = points.at(used), design[used]
     residual = points.xyz_m[:, 2] - jacobian @ found
     fit = uncertainties(jacobian, residual, points.sigma_m, points.xyz_m[:, :2])
     return StepMeasurement(
@@ -127,22 +127,7 @@ def find_walls(across_m: Array, z_m: Array) -> tuple[float, float]:
     return first, last
 
 
-def _design(points: Selection, delta: Array, centre_m: Array) -> Array:
-    xy = points.xyz_m[:, :2] - centre_m
+def _design(points: Selection, delta: Array) -> Array:
+    """Derivatives by a, b, c (at the points' centre) and h."""
+    xy = points.xyz_m[:, :2] - points.xyz_m[:, :2].mean(axis=0)
     return np.column_stack([xy, np.ones(len(points)), delta])
-
-
-def _fit(points: Selection, delta: Array) -> tuple[NDArray[np.bool_], Array, Array]:
-    """Points used, their centre, and (a, b, c, h); outliers are set aside in rounds."""
-    centre = points.xyz_m[:, :2].mean(axis=0)
-    design, z = _design(points, delta, centre), points.xyz_m[:, 2]
-    used: NDArray[np.bool_] = np.ones(len(points), dtype=np.bool_)
-    found: Array = np.zeros(4)
-    for _ in range(ROUNDS):
-        found = np.asarray(np.linalg.lstsq(design[used], z[used], rcond=None)[0], np.float64)
-        residual = z - design @ found
-        inside = np.abs(residual) <= max(TRIM_SD * robust_sd(residual[used]), 1e-15)
-        if (inside == used).all() or np.count_nonzero(inside) <= design.shape[1]:
-            break
-        used = np.asarray(inside)
-    return used, np.asarray(centre), found

@@ -1,0 +1,287 @@
+"""Measurements against closed forms, and their uncertainties against the scatter over seeds."""
+
+import numpy as np
+import pytest
+from scipy.special import erf
+
+from measured_clouds import SIGMA_M, cloud
+from sl_projector.errors import ConfigError, StackError
+from sl_reconstruct.height_map import HeightMap
+from sl_reconstruct.measure.deviation import map_reference, measure_deviation
+from sl_reconstruct.measure.groove import measure_groove
+from sl_reconstruct.measure.hole import measure_hole
+from sl_reconstruct.measure.planes import measure_angle, measure_plane
+from sl_reconstruct.measure.profile import measure_profile, save_profile
+from sl_reconstruct.measure.region import Region, select
+from sl_reconstruct.measure.result import Tolerance, inflation, uncertainties
+from sl_reconstruct.measure.rounds import measure_cylinder, measure_sphere
+from sl_reconstruct.measure.step import measure_step
+
+SEEDS = 100
+#: The issue's band for the standard deviation of z-scores. Over 100 seeds that of a perfect
+#: uncertainty scatters by 1 / sqrt(2 * 99) = 0.07 about 1.
+COVERS = (0.85, 1.15)
+#: The mean of 100 z-scores scatters by 0.1 about 0: four of these.
+MEAN = 0.4
+
+SLOPE = 0.2131
+ANGLE_DEG = 180.0 - 2.0 * np.degrees(np.arctan(SLOPE))
+
+
+def plane_scores(seed: int) -> list[float]:
+    m = measure_plane(select(cloud(lambda x, y: 0.1 * x - 0.03 * y + 1e-3, seed=seed)))
+    x, y, z = m.point_m
+    above = z - (0.1 * x - 0.03 * y + 1e-3)
+    return [(m.a - 0.1) / m.u_a, (m.b + 0.03) / m.u_b, above / m.u_c_m]
+
+
+def angle_scores(seed: int) -> list[float]:
+    points = cloud(lambda x, y: SLOPE * np.abs(x), (40, 100), seed=seed)
+    flanks = [select(points, mask=points["x"] * side > 1e-4) for side in (-1, 1)]
+    m = measure_angle(*flanks)
+    return [(m.value - ANGLE_DEG) / m.uncertainty]
+
+
+def step_scores(seed: int) -> list[float]:
+    points = cloud(lambda x, y: 0.01 * x + 5e-5 * (np.abs(x) < 0.6e-3), (30, 150), seed=seed)
+    m = measure_step(select(points))
+    return [(m.value - 5e-5) / m.uncertainty]
+
+
+def sphere_scores(seed: int) -> list[float]:
+    m = measure_sphere(select(cloud(lambda x, y: np.sqrt(0.05**2 - x * x - y * y), seed=seed)))
+    return [(m.value - 0.05) / m.uncertainty, m.centre_m[0] / m.u_centre_m[0]]
+
+
+def cylinder_scores(seed: int) -> list[float]:
+    points = cloud(lambda x, y: np.sqrt(5e-3**2 - (0.8 * x + 0.6 * y) ** 2), (30, 40), seed=seed)
+    m = measure_cylinder(select(points))
+    return [(m.value - 5e-3) / m.uncertainty]
+
+
+def disc(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A dark disc of 0.4 mm and its centre, anywhere between the points.
+
+    Its own light is anything that `HOLE_LIGHT` allows.
+    """
+    points = cloud(lambda x, y: 0.0 * x, (90, 100), (0.8e-3, 0.72e-3), seed=seed)
+    rng = np.random.default_rng(10_000 + seed)
+    own, centre = 0.04 * rng.random(), 1e-5 * rng.random(2)
+    outside_m = np.hypot(points["x"] - centre[0], points["y"] - centre[1]) - 0.2e-3
+    light = own + (1.0 - own) * 0.5 * (1.0 + erf(outside_m / (9e-6 * np.sqrt(2.0))))
+    points["intensity"] = 200.0 * light + 1.5 * rng.standard_normal(points.shape)
+    for name in "xyz":
+        points[name][points["intensity"] < 20.0] = np.nan
+    return points, centre
+
+
+AROUND = Region.rectangle(-0.39e-3, -0.35e-3, 0.39e-3, 0.35e-3)
+
+
+def hole_scores(seed: int) -> list[float]:
+    points, centre = disc(seed)
+    m = measure_hole(points, AROUND)
+    assert m.method == "intensity"
+    return [
+        (m.value - 0.4e-3) / m.uncertainty,
+        (m.centre_m[0] - centre[0]) / m.u_centre_m[0],
+        (m.centre_m[1] - centre[1]) / m.u_centre_m[1],
+    ]
+
+
+def profile_scores(seed: int) -> list[float]:
+    points = cloud(lambda x, y: 5e-5 * (np.abs(x) < 0.6e-3), (60, 100), seed=seed)
+    m = measure_profile(points, (-1.9e-3, 0.0), (1.9e-3, 0.0), 0.4e-3, 5e-5)
+    top = int(np.argmin(np.abs(m.along_m - 1.9e-3)))
+    return [m.z_m[10] / m.u_z_m[10], (m.z_m[top] - 5e-5) / m.u_z_m[top]]
+
+
+def deviation_scores(seed: int) -> list[float]:
+    m = measure_deviation(cloud(lambda x, y: 1e-3 * x + 5e-8, seed=seed), lambda x, y: 1e-3 * x)
+    return [(m.value - 5e-8) / m.uncertainty]
+
+
+SCORES = [plane_scores, angle_scores, step_scores, sphere_scores, cylinder_scores, hole_scores,
+          profile_scores, deviation_scores]  # fmt: skip
+
+
+@pytest.mark.parametrize("scores", SCORES, ids=lambda f: f.__name__.removesuffix("_scores"))
+def test_stated_uncertainties_cover_the_truth(scores) -> None:
+    z = np.array([scores(seed) for seed in range(SEEDS)])
+    assert np.abs(z.mean(axis=0)).max() < MEAN, z.mean(axis=0)
+    spread = z.std(axis=0, ddof=1)
+    # Several figures of one measurement: each within the band, widened by its own scatter of 0.07
+    # where it is not the value itself.
+    assert COVERS[0] <= spread[0] <= COVERS[1], spread
+    assert ((spread > COVERS[0] - 0.07) & (spread < COVERS[1] + 0.07)).all(), spread
+
+
+def test_flatness_is_the_form_without_the_noise() -> None:
+    """A bow of 10.75 um: far more than noise, which widens the raw peak to valley by 3 um."""
+    bow = lambda x, y: 2.0 * x * x + 3.0 * y * y  # noqa: E731
+    values = [measure_plane(select(cloud(bow, (120, 160), seed=seed))) for seed in range(8)]
+    # The deviation from the plane is the bow itself; means over 1/40 of a side lose at the corner
+    # half a cell: 2 * (2 x dx) + ... = 2 * 2e-3 * 2 * 5e-5 + 3 * 1.5e-3 * 2 * 3.75e-5 = 0.74 um.
+    whole = 2.0 * 2e-3**2 + 3.0 * 1.5e-3**2
+    for m in values:
+        assert whole - 0.74e-6 - 4 * m.uncertainty < m.value < whole + 4 * m.uncertainty
+
+
+def test_errors_that_neighbours_share_enlarge_the_uncertainty() -> None:
+    """Noise that is equal over 10 x 10 points has 100 times the variance of its mean."""
+    rng = np.random.default_rng(1)
+    points = cloud(lambda x, y: 0.0 * x, (100, 100))
+    points["z"] = np.kron(rng.standard_normal((10, 10)), np.ones((10, 10))) * SIGMA_M
+    m = measure_plane(select(points))
+    # 97 free block means: their variance scatters by sqrt(2 / 97) = 0.14 about 1.
+    assert m.inflation == pytest.approx(10.0, rel=0.4)
+
+
+def test_independent_errors_do_not() -> None:
+    rng = np.random.default_rng(2)
+    xy = rng.random((4000, 2))
+    assert inflation(rng.standard_normal(4000), np.ones(4000), xy, 3) == 1.0
+
+
+def test_scatter_beyond_the_stated_sigma_counts() -> None:
+    """Roughness of 3 um under a sigma of 0.3: the uncertainty follows the residuals."""
+    points = cloud(lambda x, y: 0.0 * x)
+    rough = points.copy()
+    rough["z"] += 3e-6 * np.random.default_rng(3).standard_normal(points.shape)
+    smooth, coarse = measure_plane(select(points)), measure_plane(select(rough))
+    # sqrt(3^2 + 0.38^2) / 0.38 = 8 (mean square of the stated sigmas: 0.38 um).
+    assert coarse.u_c_m / smooth.u_c_m == pytest.approx(8.0, rel=0.1)
+
+
+def test_uncertainty_of_a_mean_is_its_closed_form() -> None:
+    sigma = np.array([1.0, 2.0, 3.0, 4.0])
+    fit = uncertainties(np.ones((4, 1)), np.array([1.0, -1, 1, -1]), sigma, np.zeros((4, 2)))
+    assert fit.covariance[0, 0] == pytest.approx(np.sum(sigma**2) / 16)
+    assert fit.dof == 3
+
+
+@pytest.mark.parametrize("measure", [measure_plane, measure_sphere, measure_step])
+def test_outliers_are_set_aside_and_counted(measure) -> None:
+    shapes = {
+        measure_plane: lambda x, y: 0.1 * x,
+        measure_sphere: lambda x, y: np.sqrt(0.05**2 - x * x - y * y),
+        measure_step: lambda x, y: 5e-5 * (np.abs(x) < 0.6e-3),
+    }
+    points = cloud(shapes[measure], (60, 150))
+    clean = measure(select(points))
+    points["z"][::10, ::10] += 30e-6  # 90 of 9000 points
+    spoilt = measure(select(points))
+    counted = spoilt.set_aside - clean.set_aside
+    assert counted == 90 if measure is not measure_step else 20 < counted < 90
+    assert abs(spoilt.value - clean.value) < 0.5 * max(clean.uncertainty, spoilt.uncertainty)
+
+
+def test_exact_shapes_give_exact_values() -> None:
+    """Without noise only rounding is left: 1e-16 of the coordinates, over the lever of a cap."""
+    exact = {"sigma_m": 0.0}
+    sphere = cloud(lambda x, y: -np.sqrt(0.05**2 - x * x - y * y), **exact)
+    assert measure_sphere(select(sphere)).value == pytest.approx(0.05, abs=1e-11)
+    hollow = cloud(lambda x, y: 7e-3 - np.sqrt(5e-3**2 - (x - y) ** 2 / 2), **exact)
+    cylinder = measure_cylinder(select(hollow))
+    assert cylinder.value == pytest.approx(5e-3, abs=1e-12)
+    np.testing.assert_allclose(cylinder.direction, [0.5**0.5, 0.5**0.5, 0.0], atol=1e-12)
+    assert cylinder.point_m[2] == pytest.approx(7e-3, abs=1e-12)
+    groove = measure_groove(cloud(lambda x, y: SLOPE * np.abs(x), (50, 400), **exact))
+    assert groove is not None
+    assert groove.value == pytest.approx(ANGLE_DEG, abs=1e-9)
+    channel = cloud(lambda x, y: -2e-5 * (np.abs(y) < 0.4e-3) + 0.01 * y, (150, 40), **exact)
+    step = measure_step(select(channel), "y")
+    assert step.value == pytest.approx(-2e-5, abs=1e-15)
+    np.testing.assert_allclose(step.walls_m, [-0.4e-3, 0.4e-3], atol=3e-3 / 150)
+
+
+def test_the_step_keeps_away_from_its_walls() -> None:
+    """ISO 5436-1: what lies within a third of the width of a wall does not count."""
+    width = 1.2e-3
+    points = cloud(lambda x, y: 5e-5 * (np.abs(x) < width / 2), (20, 300), sigma_m=0.0)
+    from_wall = np.abs(np.abs(points["x"]) - width / 2)
+    points["z"] += np.where(from_wall < 0.3 * width, 1e-5, 0.0)
+    assert measure_step(select(points)).value == pytest.approx(5e-5, abs=1e-15)
+
+
+def test_a_plane_has_no_angle_to_itself_and_a_groove_needs_flanks() -> None:
+    flat = cloud(lambda x, y: 0.0 * x, (40, 400))
+    m = measure_angle(select(flat), select(flat))
+    assert m.value == pytest.approx(180.0)
+    assert m.uncertainty > 0.0
+    assert measure_groove(flat) is None
+
+
+def test_a_deep_hole_is_found_by_where_points_end() -> None:
+    """Points end in the edge's blur, none is darker: the diameter says how little it knows."""
+    points, centre = disc(0)
+    points["z"][points["intensity"] < 190.0] = np.nan
+    m = measure_hole(points, AROUND)
+    assert m.method == "presence"
+    assert abs(m.value - 0.4e-3) < 2.0 * m.uncertainty < 40e-6
+    np.testing.assert_allclose(m.centre_m, centre, atol=4e-6)
+
+
+def test_a_deviation_map_shows_what_differs() -> None:
+    """A bump of 5 um beside a reference from file, tilt of the mounting taken out."""
+    nodes = np.linspace(-2.5e-3, 2.5e-3, 51)
+    reference = HeightMap((0.02 * nodes[None, :] + 0 * nodes[:, None]).astype(np.float32),
+                          -2.5e-3, 2.5e-3, 1e-4)  # fmt: skip
+    bump = lambda x, y: 5e-6 * ((x > 1.8e-3) & (y > 1.35e-3))  # noqa: E731
+    points = cloud(lambda x, y: 0.025 * x + 1e-5 + bump(x, y), (60, 80))
+    m = measure_deviation(points, map_reference(reference), level=True)
+    assert m.value == 0.0
+    assert m.set_aside == np.count_nonzero(bump(points["x"], points["y"]) > 0)
+    assert np.nanmedian(m.deviation_m[points["z"] > 0]) == pytest.approx(0.0, abs=SIGMA_M)
+    assert np.median(m.deviation_m[bump(points["x"], points["y"]) > 0]) == pytest.approx(
+        5e-6, abs=4 * SIGMA_M / np.sqrt(12)
+    )
+
+
+def test_a_section_goes_to_csv(tmp_path) -> None:
+    points = cloud(lambda x, y: 0.5 * x)
+    m = measure_profile(points, (-1e-3, 0.0), (1e-3, 0.0), 0.5e-3, 1e-4)
+    save_profile(tmp_path / "s.csv", m)
+    back = np.genfromtxt(tmp_path / "s.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(back["z_m"], 0.5 * (back["along_m"] - 1e-3), atol=2e-6)
+    assert (back["u_z_m"] > 0).all()
+
+
+# -- regions and tolerances --------------------------------------------------------------------
+
+
+def test_a_polygon_holds_what_lies_inside() -> None:
+    triangle = Region.of([0, 0, 2, 0, 0, 2])
+    x, y = np.array([0.5, 1.5, -0.1, np.nan]), np.array([0.5, 1.5, 0.5, 0.5])
+    assert triangle.contains(x, y).tolist() == [True, False, False, False]
+
+
+@pytest.mark.parametrize("numbers", [[0, 0, 1], [0, 0, 0, 1], [0, 0, 1, 1, 2, 2]])
+def test_a_region_without_area_is_refused(numbers) -> None:
+    with pytest.raises(ConfigError):
+        Region.of(numbers)
+
+
+def test_what_cannot_be_measured_is_refused_with_a_reason() -> None:
+    flat = cloud(lambda x, y: 0.0 * x, sigma_m=0.0)
+    with pytest.raises(StackError, match="no points"):
+        select(flat, Region.of([1, 1, 2, 2]))
+    with pytest.raises(StackError, match="sphere"):
+        measure_sphere(select(flat))
+    with pytest.raises(StackError, match="cylinder"):
+        measure_cylinder(select(flat))
+    with pytest.raises(StackError, match="no step"):
+        measure_step(select(cloud(lambda x, y: 0.01 * x)))
+    with pytest.raises(StackError, match="hole"):
+        measure_hole(flat, Region.rectangle(-1e-3, -1e-3, 1e-3, 1e-3))
+    with pytest.raises(StackError, match="plane"):
+        measure_plane(select(flat[:1, :2]))
+
+
+@pytest.mark.parametrize(
+    ("value", "verdict"),
+    [(10.0, "pass"), (10.8, "pass"), (10.9, "undecided"), (11.1, "undecided"), (11.2, "fail")],
+)
+def test_a_verdict_needs_95_percent(value: float, verdict: str) -> None:
+    """Guard band 1.645 u = 0.1645 inside and outside of 11."""
+    assert Tolerance(9.0, 11.0).verdict(value, 0.1) == verdict
