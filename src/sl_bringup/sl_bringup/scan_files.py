@@ -51,7 +51,7 @@ def write_scan(
     notes = {key: report[key] for key in ("calibration_hash", "settings_hash", "cloud_hash")}
     points = present(cloud.points)
     save_ply(folder / "cloud.ply", points, notes)
-    save_pcd(folder / "cloud.pcd", points, notes)
+    save_pcd(folder / "cloud.pcd", cloud.points, notes, organised=True)
     plane = _best_plane(cloud, report)
     height = _height_map(folder, cloud, report)
     if not with_pictures:
