@@ -117,7 +117,7 @@ def test_stated_uncertainties_cover_the_truth(scores) -> None:
 
 
 def test_flatness_is_the_form_without_the_noise() -> None:
-    """A bow of 10.75 um: far more than noise, which widens the raw peak to valley by 3 um."""
+    """A bow of 14.75 um: far more than noise, which widens the raw peak to valley by 3 um."""
     bow = lambda x, y: 2.0 * x * x + 3.0 * y * y  # noqa: E731
     values = [measure_plane(select(cloud(bow, (120, 160), seed=seed))) for seed in range(8)]
     # The deviation from the plane is the bow itself; means over 1/40 of a side lose at the corner
