@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from sl_reconstruct.reasons import REFUSALS, Reason
@@ -98,6 +100,19 @@ class Cloud:
 
 def count_reasons(reason: NDArray[np.uint8]) -> tuple[dict[str, int], int]:
     """Refused positions by name, and the number of lit positions."""
-    counts = np.bincount(reason.ravel(), minlength=len(Reason))
+    counts = _histogram(reason, len(Reason))
     refused = {name: int(counts[code]) for code, name in REFUSALS.items()}
     return refused, int(reason.size - counts[Reason.UNLIT])
+
+
+@njit(cache=True, nogil=True)
+def _histogram(values: Any, size: int) -> Any:
+    counts = np.zeros(size, np.int64)
+    for y in range(values.shape[0]):
+        row = values[y]
+        for code in range(size):
+            n = 0
+            for x in range(row.size):
+                n += row[x] == code
+            counts[code] += n
+    return counts

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sl_reconstruct.pixels import PixelRow, sample_count
+from sl_reconstruct.pixels import PixelRow, count_shift
 from sl_reconstruct.reasons import Reason
 
 #: Sub-pixel phases at which the noise gain of the estimator is tabulated.
@@ -144,20 +144,33 @@ def single_signal(image: Any, p: PixelRow, floor_dn: float, signal: Any) -> None
 def smooth(signal: Any, taps: Any, out: Any) -> None:
     """Convolve with a symmetric kernel; samples that it does not cover keep the raw signal."""
     n, radius = signal.size, taps.size - 1
-    centre = taps[0]
-    for x in range(n):
+    for x in range(radius):
         out[x] = signal[x]
-    if radius == 0:
-        return
-    inner = out[radius : n - radius]
-    mid = signal[radius : n - radius]
-    for x in range(inner.size):
-        inner[x] = centre * mid[x]
-    for j in range(1, radius + 1):
+        out[n - 1 - x] = signal[n - 1 - x]
+    inner, mid = out[radius : n - radius], signal[radius : n - radius]
+    done = min(4, radius)
+    if done == 4:  # one pass for the usual kernels
+        _smooth_nine(signal[radius - 4 : n - radius + 4], taps, inner)
+    else:
+        done = 0
+        for x in range(inner.size):
+            inner[x] = taps[0] * mid[x]
+    for j in range(done + 1, radius + 1):
         left, right = signal[radius - j : n - radius - j], signal[radius + j : n - radius + j]
         w = taps[j]
         for x in range(inner.size):
             inner[x] += w * (left[x] + right[x])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _smooth_nine(s: Any, taps: Any, out: Any) -> None:
+    a, b, c, d, e = taps[0], taps[1], taps[2], taps[3], taps[4]
+    n = out.size
+    s1, s2, s3, s4, s5 = s[1:], s[2:], s[3:], s[4:], s[5:]
+    s6, s7, s8 = s[6:], s[7:], s[8:]
+    for x in range(n):
+        near = a * s4[x] + b * (s3[x] + s5[x]) + c * (s2[x] + s6[x])
+        out[x] = near + d * (s1[x] + s7[x]) + e * (s[x] + s8[x])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -220,28 +233,27 @@ def find_zeros(filtered: Any, at: Any, count: int, fraction: Any, slope: Any) ->
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def light_fails(light: Any, clipped: Any, x: int, t: Tuning) -> int:
-    """Reason why the light under the edge between x and x + 1 does not do, or 0."""
-    first, last = x - t.reach_px, x + 1 + t.reach_px
-    if first < 0 or last >= light.size:
-        return SHADOW  # the image ends
-    left, right = light[first], light[last]
-    least = min(light[x], light[x + 1])
+def light_fails(left: float, under: float, right: float, t: Tuning) -> int:
+    """Reason why the light left of, under and right of an edge does not do, or 0."""
     sides, most = min(left, right), max(left, right)
-    if max(most, least) < t.contrast_dn:
+    least = min(under, sides)
+    if max(most, under) < t.contrast_dn:
         return CONTRAST
-    if clipped[first] | clipped[x] | clipped[x + 1] | clipped[last]:
-        return SATURATION
-    if min(least, sides) < t.min_light * most or least < DIP * sides:
+    if least < t.min_light * most or under < DIP * sides:
         return SHADOW
-    return CONTRAST if min(least, sides) < t.contrast_dn else 0
+    return CONTRAST if least < t.contrast_dn else 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def check_light(light: Any, clipped: Any, at: Any, count: int, t: Tuning, why: Any) -> None:
     """Write for each crossing why the light under it does not do, or 0."""
+    last = light.size - 1
     for i in range(count):
-        why[i] = light_fails(light, clipped, np.int64(at[i]), t)
+        x = np.int64(at[i])
+        a, b = max(0, x - t.reach_px), min(last, x + 1 + t.reach_px)
+        reason = light_fails(light[a], min(light[x], light[x + 1]), light[b], t)
+        full = clipped[a] | clipped[x] | clipped[x + 1] | clipped[b]
+        why[i] = SATURATION if full and reason != CONTRAST else reason
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -276,13 +288,15 @@ def identify(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def pair_variance(total: float, gain: Any, i: int, plateau: float, t: Tuning) -> float:
+def pair_variance(
+    total: float, gain: float, profile_gain: float, plateau: float, t: Tuning
+) -> float:
     """Variance of a pair's filtered signal times total^2, DN^2; total = P + N at the edge.
 
     var((P - N)/(P + N)) = [2 a (1 + q^2) + b S (1 - q^2)] / S^2 for pixel noise a + b * level.
     """
-    q2 = gain[i, 1] * plateau * plateau
-    return 2 * t.noise_dn2 * (gain[i, 0] + q2) + t.noise_dn * total * (gain[i, 0] - q2)
+    q2 = profile_gain * plateau * plateau
+    return 2 * t.noise_dn2 * (gain + q2) + t.noise_dn * total * (gain - q2)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -315,10 +329,12 @@ def weigh_pairs(
     for i in range(count):
         x = at[i]
         whole = np.float64(pattern[x]) + np.float64(inverse[x]) + t.floor_dn
-        variance = pair_variance(whole, gain, phase_of(fraction[i]), light[x] / whole, t)
+        row = phase_of(fraction[i])
+        variance = pair_variance(whole, gain[row, 0], gain[row, 1], light[x] / whole, t)
         steep = slope[i] * whole
-        sigma[i] = np.sqrt(variance) / steep
-        width[i] = 2 * light[x] * full_slope / steep
+        inverse_steep = np.float32(1) / np.float32(steep)
+        sigma[i] = np.sqrt(np.float32(variance)) * inverse_steep
+        width[i] = np.float32(2) * light[x] * np.float32(full_slope) * inverse_steep
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -331,13 +347,14 @@ def weigh_singles(
     """
     at, fraction, slope, sigma, width = r.at, r.fraction, r.slope, r.sigma, r.width
     threshold, light, bright, dark, filtered = p.threshold, p.light, p.bright, p.dark, r.filtered
+    shift = count_shift(bright.itemsize)
     for i in range(count):
         x = at[i]
         level = np.float64(threshold[x])
         if centre:
             level += 0.5 * light[x] if filtered[x] < 0 else -0.5 * light[x]
-        b, d = sample_count(bright, x), sample_count(dark, x)
+        b, d = max(1, bright[x] >> shift), max(1, dark[x] >> shift)
         variance = single_variance(threshold[x], light[x], b, d, level, t)
         variance *= gain[phase_of(fraction[i]), 0]
-        sigma[i] = np.sqrt(variance) / (light[x] * slope[i])
-        width[i] = full_slope / slope[i]
+        sigma[i] = np.sqrt(np.float32(variance)) / (light[x] * slope[i])
+        width[i] = np.float32(full_slope) / slope[i]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
@@ -28,6 +30,7 @@ def tap_variance(taps: Array) -> float:
     return float(2 * np.sum(taps[1:] * np.arange(1, taps.size) ** 2))
 
 
+@cache
 def cubic_weights(phase: float) -> Array:
     """Weights of the samples -1, 0, 1, 2 in the cubic through them, at a phase in [0, 1]."""
     powers = np.vander([-1.0, 0.0, 1.0, 2.0], 4, increasing=True)
@@ -56,7 +59,7 @@ def noise_gain(taps: Array, blur_px: float) -> Array:
     full = np.concatenate([taps[:0:-1], taps])
     radius = taps.size - 1
     out = np.zeros((PHASES + 1, 2))
-    for i, phase in enumerate(np.linspace(0, 1, PHASES + 1)):
+    for i, phase in enumerate(np.linspace(0, 1, PHASES + 1).tolist()):
         weights = np.convolve(cubic_weights(phase), full)
         x = np.arange(weights.size) - 1 - radius - phase
         profile = erf(x / (np.sqrt(2) * max(blur_px, 1e-3)))
@@ -64,11 +67,12 @@ def noise_gain(taps: Array, blur_px: float) -> Array:
     return out
 
 
+@cache
 def bar_gain() -> Array:
     """Like ``noise_gain`` for BR8."""
     kernel = np.array([1.0, 1, 1, 1, 0, -1, -1, -1, -1])
     out = np.zeros((PHASES + 1, 2))
-    for i, phase in enumerate(np.linspace(0, 1, PHASES + 1)):
+    for i, phase in enumerate(np.linspace(0, 1, PHASES + 1).tolist()):
         weights = np.convolve(cubic_weights(phase), kernel)
         out[i] = np.sum(weights**2)
     return out
@@ -95,7 +99,10 @@ def edge_filter(plan: AxisPlan, matched: bool, blur_px: float, scale: float) -> 
     ]
     radius = max(k.size for k in kernels)
     padded = np.array([np.pad(k, (0, radius - k.size)) for k in kernels])
-    gain = [noise_gain(k, blur_px) for k in kernels] + [bar_gain()]
+    tables = {
+        k.tobytes(): noise_gain(k, blur_px) for k in {k.tobytes(): k for k in kernels}.values()
+    }
+    gain = [tables[k.tobytes()] for k in kernels] + [bar_gain()]
     total = [float(np.sqrt(blur_px**2 + tap_variance(k))) for k in kernels]
     slope = [stripe_slope(w, s) for w, s in zip(stripes, total, strict=True)]
     slope.append(bar_slope(min(stripes), blur_px))

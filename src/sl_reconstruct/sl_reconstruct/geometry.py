@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from sl_reconstruct.rig import Device, Division, Rig
 
 DIVISION, BROWN_CONRADY = 0, 1
-#: Iterations allowed to a lens model. They contract by the distortion, so that a step of SOLVED
-#: leaves an error far below it: 1e-10 of a slope is 1e-11 m at 0.1 m before the last step.
+#: Iterations allowed to a lens model. They contract by the distortion (0.1 at most), so that the
+#: last step, of SOLVED in slope, leaves less than 1e-10 m at 1 m.
 MAX_ITERATIONS = 60
-SOLVED = 1e-10
+SOLVED = 1e-9
+#: An undistortion without such a margin goes on to this step.
+EXACT = 1e-14
 
 Array = NDArray[np.float64]
 
@@ -133,7 +135,7 @@ def brown_undistort(lens: Any, xd: float, yd: float) -> tuple[float, float]:
         radial, tx, ty, _, _ = brown_forward(lens, x, y)
         last_x, last_y = x, y
         x, y = (xd - tx) / radial, (yd - ty) / radial
-        if not abs(x - last_x) + abs(y - last_y) > SOLVED:
+        if not abs(x - last_x) + abs(y - last_y) > EXACT:
             break
     return x, y
 

@@ -26,9 +26,10 @@ class PixelRow(NamedTuple):
     ``middle``: integer threshold between them. ``light``: bright minus dark, DN.
     ``threshold``: sub-DN threshold, NaN where unknown (dynamic only). ``bright``, ``dark``:
     clean samples (dynamic only), their sum in the low bits and their count above.
-    ``ratio``: dark over bright level. ``bit``, ``clean``, ``parity``: a bit plane, where it is
-    far from its edges, and the running parity. ``code``: division number. ``lit``: 1
-    where lit; ``clipped``: 1 where saturated.
+    ``ratio``: dark over bright level; ``unknown``: where it is not known, a byte each, seen as
+    ``words`` too. ``bit``, ``clean``, ``parity``: a bit plane, where it is far from its edges,
+    and the running parity. ``code``: division number. ``lit``: 1 where lit; ``clipped``: 1 where
+    saturated.
     """
 
     low: NDArray[Any]
@@ -37,6 +38,8 @@ class PixelRow(NamedTuple):
     light: NDArray[np.float32]
     threshold: NDArray[np.float32]
     ratio: NDArray[np.float32]
+    words: NDArray[np.uint64]
+    unknown: NDArray[np.uint8]
     bright: NDArray[Any]
     dark: NDArray[Any]
     bit: NDArray[np.uint8]
@@ -50,20 +53,15 @@ class PixelRow(NamedTuple):
 def pixel_row(width: int, dtype: Any) -> PixelRow:
     """Return scratch for rows of ``width`` pixels of a stack of type ``dtype``."""
     sums = np.uint16 if dtype == np.uint8 else np.uint32
-    types = [
-        dtype,
-        dtype,
-        dtype,
-        np.float32,
-        np.float32,
-        np.float32,
-        sums,
-        sums,
-        np.uint8,
-        np.uint8,
-    ]
-    types += [np.uint8, np.uint16, np.uint8, np.uint8]
-    return PixelRow(*(np.zeros(width, t) for t in types))
+    words = np.zeros((width + 7) // 8, np.uint64)
+    low, high, middle = (np.zeros(width, dtype) for _ in range(3))
+    light, threshold, ratio = (np.zeros(width, np.float32) for _ in range(3))
+    bit, clean, parity, lit, clipped = (np.zeros(width, np.uint8) for _ in range(5))
+    return PixelRow(
+        low, high, middle, light, threshold, ratio, words, words.view(np.uint8),
+        np.zeros(width, sums), np.zeros(width, sums), bit, clean, parity,
+        np.zeros(width, np.uint16), lit, clipped,
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -127,11 +125,12 @@ def _find_clean(bit: Any, reach: int, clean: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add(row: Any, clean: Any, wanted: int, shift: int, sums: Any) -> None:
-    """Add sample and count where ``clean`` is ``wanted``."""
+def _add(row: Any, clean: Any, shift: int, bright: Any, dark: Any) -> None:
+    """Add sample and count to the bright sums where ``clean`` is 2, to the dark where it is 0."""
     for x in range(row.size):
-        take = np.uint8(clean[x] == wanted)
-        sums[x] = sums[x] + (row[x] + (1 << shift)) * take
+        sample = row[x] + (1 << shift)
+        bright[x] = bright[x] + sample * np.uint8(clean[x] == 2)
+        dark[x] = dark[x] + sample * np.uint8(clean[x] == 0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -143,16 +142,29 @@ def _mean(sums: Any, shift: int, out: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _carry(values: Any) -> None:
-    """Carry values into gaps of at most CARRY_PX, on a straight line between their ends."""
-    last = -1
-    for x in range(values.size):
-        if values[x] == values[x]:
-            if 1 < x - last <= CARRY_PX and last >= 0:
-                for i in range(last + 1, x):
-                    w = np.float32((i - last) / (x - last))
-                    values[i] = values[last] * (1 - w) + values[x] * w
-            last = x
+def _carry(values: Any, unknown: Any, words: Any) -> None:
+    """Carry values into gaps of at most CARRY_PX, on a straight line between their ends.
+
+    ``unknown`` has a byte for each value, and is seen as ``words`` to pass over known ones.
+    """
+    n = values.size
+    for x in range(n):
+        unknown[x] = np.uint8(values[x] != values[x])
+    done = 0
+    for word in range(words.size):
+        if words[word] == 0:
+            continue
+        for x in range(max(done, 8 * word), min(8 * word + 8, n)):
+            if x < done or not unknown[x]:
+                continue
+            done = x + 1
+            while done < n and unknown[done]:
+                done += 1
+            if x > 0 and done < n and done - x < CARRY_PX:
+                a, b = values[x - 1], values[done]
+                for i in range(x, done):
+                    w = np.float32((i + 1 - x) / (done + 1 - x))
+                    values[i] = a * (1 - w) + b * w
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -197,7 +209,7 @@ def set_threshold(stack: Any, y: int, images: Any, reach: int, p: PixelRow) -> N
     edge of their image: means have no noise bias, as extremes have.
     """
     bright, dark, bit, middle, clean = p.bright, p.dark, p.bit, p.middle, p.clean
-    shift = COUNT_SHIFT_8 if bright.itemsize == 2 else COUNT_SHIFT_16
+    shift = count_shift(bright.itemsize)
     for x in range(bright.size):
         bright[x] = 0
         dark[x] = 0
@@ -207,8 +219,7 @@ def set_threshold(stack: Any, y: int, images: Any, reach: int, p: PixelRow) -> N
         for x in range(bit.size):
             bit[x] = np.uint8(row[x] > middle[x])
         _find_clean(bit, reach, clean)
-        _add(row, clean, 2, shift, bright)
-        _add(row, clean, 0, shift, dark)
+        _add(row, clean, shift, bright, dark)
     _mean(bright, shift, p.light)
     _mean(dark, shift, p.threshold)
     missing = 0
@@ -218,7 +229,7 @@ def set_threshold(stack: Any, y: int, images: Any, reach: int, p: PixelRow) -> N
         ratio[x] = d / b
         missing += np.isnan(d)
     if missing:
-        _carry(ratio)
+        _carry(ratio, p.unknown, p.words)
         for x in range(threshold.size):
             threshold[x] = light[x] * ratio[x] if np.isnan(threshold[x]) else threshold[x]
     for x in range(threshold.size):
@@ -233,8 +244,9 @@ def _fill_light(p: PixelRow) -> None:
     """Plain contrast where a pixel was never clearly bright."""
     light, high, low = p.light, p.high, p.low
     for x in range(light.size):
+        a = light[x]
         plain = np.float32(high[x]) - np.float32(low[x])
-        light[x] = light[x] if light[x] == light[x] else plain
+        light[x] = plain if np.isnan(a) else a
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -247,8 +259,7 @@ def set_masks(p: PixelRow, lit_dn: float, saturation: int) -> None:
         clipped[x] = np.uint8(high[x] >= saturation)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def sample_count(sums: Any, x: int) -> Any:
-    """Number of clean samples behind a pixel's sum, at least 1."""
-    shift = COUNT_SHIFT_8 if sums.itemsize == 2 else COUNT_SHIFT_16
-    return max(1, sums[x] >> shift)
+@njit(cache=True, nogil=True, error_model="numpy")
+def count_shift(itemsize: int) -> int:
+    """Bits of a sum of samples below their count, for sums of so many bytes."""
+    return COUNT_SHIFT_8 if itemsize == 2 else COUNT_SHIFT_16

@@ -40,6 +40,8 @@ FIRST_BLUR_PX = 1.0
 REACH_SD = 2.5
 #: A jump counts from so many standard deviations on.
 JUMP_SD = 6.0
+#: Every so many surveyed rows the order of the boundaries is checked.
+ORDER_STEP = 3
 #: Distance to both neighbours together, over twice the least distance to one.
 WIDE_SPACING = 1.35
 #: A usable BR8 needs this slope at a stripe's centre, per pixel of a unit stripe.
@@ -185,7 +187,7 @@ class Reconstructor:
         images = [s.image for s in plan.sources]
         check_identity(lines.tally, images)
         check_phase(lines.u_px[ys], layout.edge_owner, images)
-        order = check_order(lines.u_px[ys])
+        order = check_order(lines.u_px[ys[::ORDER_STEP]])
         return state, lines, figures_of(state, layout, lines, ys, order)
 
     def _lines(self, key: tuple[Any, ...]) -> Lines:

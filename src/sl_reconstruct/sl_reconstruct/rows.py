@@ -95,56 +95,48 @@ def decode_pixels(stack: Any, y: int, plan: Layout, t: Tuning, p: PixelRow) -> N
     set_masks(p, t.lit_dn, t.saturation)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _write(
-    u_px: Any, sigma_px: Any, width_px: Any, reason: Any, k: int, u: float, sigma: float,
-    width: float,
-) -> None:  # fmt: skip
-    """Write a found boundary; one that was there already is in doubt, and refused."""
-    if reason[k] == PRESENT or reason[k] == ORDER:
-        reason[k] = ORDER
-        u_px[k] = np.nan
-        return
-    reason[k] = PRESENT
-    u_px[k] = u
-    sigma_px[k] = sigma
-    width_px[k] = width
-
-
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _refuse(reason: Any, k: int, why: int) -> None:
-    if k > 0 and reason[k] != PRESENT and reason[k] != ORDER:
-        reason[k] = why
+# Inner loops call no function that takes an array: numba would count references for each call.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _settle(
-    owner: Any, s: int, r: SourceRow, count: int, least: float, most: float, out: Found, tally: Any
-) -> None:
-    """Accept or refuse each crossing of one source, and write it where it belongs."""
-    at, fraction, width, sigma = r.at, r.fraction, r.width, r.sigma
-    ks, agreed, why = r.k, r.agreed, r.why
-    u_px, sigma_px, width_px, reasons = out.u_px, out.sigma_px, out.width_px, out.reason
+def _judge(r: SourceRow, count: int, least: float, most: float, tally: Any) -> None:
+    """Refuse crossings of another shape than the blur makes, or whose identity disagrees."""
+    width, fraction, agreed, why = r.width, r.fraction, r.agreed, r.why
+    low, high = np.float32(least), np.float32(most)
+    first, last = np.float32(-0.5), np.float32(1.5)
     accepted = confused = 0
     for i in range(count):
-        k, reason = int(ks[i]), int(why[i])
-        shaped = (
-            (width[i] >= least) & (width[i] <= most) & (fraction[i] >= -0.5) & (fraction[i] <= 1.5)
-        )
-        if reason == 0 and not shaped:
-            reason = SHAPE
-        if reason == 0 and not agreed[i]:
-            reason = IDENTITY
-            confused += 1
-        accepted += reason == 0
-        if k == 0 or owner[k] != s:
-            continue
-        if reason == 0:
-            _write(u_px, sigma_px, width_px, reasons, k, at[i] + fraction[i], sigma[i], width[i])
-        else:
-            _refuse(reasons, k, reason)
+        shaped = (width[i] >= low) & (width[i] <= high)
+        shaped &= (fraction[i] >= first) & (fraction[i] <= last)
+        reason = why[i] if why[i] != 0 else np.uint8(0 if shaped else SHAPE)
+        doubt = (reason == 0) & (agreed[i] == 0)
+        why[i] = np.uint8(IDENTITY) if doubt else reason
+        confused += doubt
+        accepted += why[i] == 0
     tally[0] += accepted
     tally[1] += confused
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _settle(owner: Any, s: int, r: SourceRow, count: int, out: Found) -> None:
+    """Write each crossing where it belongs; a boundary found twice is in doubt, and refused."""
+    at, fraction, width, sigma, ks, why = r.at, r.fraction, r.width, r.sigma, r.k, r.why
+    u_px, sigma_px, width_px, reasons = out.u_px, out.sigma_px, out.width_px, out.reason
+    for i in range(count):
+        k = np.int64(ks[i])
+        if k <= 0 or owner[k] != s:
+            continue
+        before = reasons[k]
+        if before in (PRESENT, ORDER):
+            if why[i] == 0:
+                reasons[k] = ORDER
+                u_px[k] = np.nan
+            continue
+        reasons[k] = why[i]
+        if why[i] == 0:
+            u_px[k] = at[i] + fraction[i]
+            sigma_px[k] = sigma[i]
+            width_px[k] = width[i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -162,7 +154,8 @@ def _edges(
         weigh_pairs(pattern, inverse, p.light, f.gain[s], f.slope[s], t, r, count)
     else:
         weigh_singles(p, f.gain[s], f.slope[s], False, t, r, count)
-    _settle(plan.edge_owner, s, r, count, t.least_width, t.most_width, out, tally)
+    _judge(r, count, t.least_width, t.most_width, tally)
+    _settle(plan.edge_owner, s, r, count, out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -179,8 +172,8 @@ def _bars(
     check_light(p.light, p.clipped, r.at, count, t, r.why)
     last = f.slope.size - 1
     weigh_singles(p, f.gain[last], f.slope[last], True, t, r, count)
-    least, most = t.least_width / BAR_LATITUDE, BAR_LATITUDE * t.most_width
-    _settle(plan.centre_owner, s, r, count, least, most, out, tally)
+    _judge(r, count, t.least_width / BAR_LATITUDE, BAR_LATITUDE * t.most_width, tally)
+    _settle(plan.centre_owner, s, r, count, out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

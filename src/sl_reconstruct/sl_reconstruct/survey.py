@@ -13,12 +13,12 @@ from sl_reconstruct.pixels import PixelRow
 from sl_reconstruct.rows import Layout, decode_pixels
 
 #: Rows looked at, evenly spread over the image.
-SURVEY_ROWS = 24
+SURVEY_ROWS = 16
 #: Distance over which the code's growth is measured, camera pixels.
 LAG_PX = 32
 NOISE_BINS = 8
 #: Every so many surveyed rows the noise is measured.
-NOISE_STEP = 4
+NOISE_STEP = 5
 #: Samples of one pixel must be at least so many before their scatter counts.
 MIN_SAMPLES = 4
 
