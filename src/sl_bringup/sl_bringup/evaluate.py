@@ -151,7 +151,8 @@ def run(args: argparse.Namespace) -> int:
     faults = list(_tell(args, results))
     for fault in faults:
         complain(f"slrig: {fault}")
-    say(f"results in {args.output}")
+    if args.output.exists():
+        say(f"results in {args.output}")
     return 1 if faults else 0
 
 
