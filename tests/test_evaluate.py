@@ -14,8 +14,8 @@ import pytest
 from plyfile import PlyData
 
 from sl_bringup.bag_writer import new_bag
-from sl_bringup.cli import main
 from sl_bringup.choices import parse_choices
+from sl_bringup.cli import main
 from sl_projector.errors import ConfigError
 from sl_projector.sequence import PatternSequence
 from sl_reconstruct.calibration_file import Calibration, rig_hash, save_calibration

@@ -127,8 +127,8 @@ def _result_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
 #: Figures that the page explains; all are in the JSON report.
 FIGURES: Mapping[str, tuple[str, str]] = {
     "edge_sigma_px": ("Edge noise, 1 sigma", "camera px"),
-    "edge_bound_px": ("Least possible edge noise (Cramer-Rao)", "camera px"),
-    "bound_ratio": ("Edge noise over the least possible", ""),
+    "edge_bound_px": ("Bound of the edge noise (Cramer-Rao, white noise)", "camera px"),
+    "bound_ratio": ("Edge noise over that bound; the dark side is quieter than white noise", ""),
     "edge_blur_px": ("Blur of the edges", "camera px"),
     "scale_px": ("Camera pixels per DMD column", "px"),
     "median_gap_m": ("Camera and projector rays miss each other by (median)", "m"),
