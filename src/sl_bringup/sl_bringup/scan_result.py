@@ -123,7 +123,8 @@ def summary(report: Mapping[str, Any]) -> Iterator[str]:
     )
     yield f"sigma of z        {micrometres(report['median_sigma_m'])} (median of the stated ones)"
     if "bound_ratio" in report["figures"]:
-        yield f"edge noise        {report['figures']['bound_ratio']:.3f} x the bound for white noise"
+        ratio = report["figures"]["bound_ratio"]
+        yield f"edge noise        {ratio:.3f} x the bound for white noise"
     refused = {k: v for k, v in report["refused"].items() if v}
     listed = ", ".join(f"{count:,} {reason}" for reason, count in refused.items())
     yield f"refused           {listed or 'none'}"
@@ -152,6 +153,6 @@ def _groove_lines(report: Mapping[str, Any]) -> Iterator[str]:
             f"rms {micrometres(plane['rms_m'])}, {plane['points']:,} points"
         )
     angle, u = groove["included_angle_deg"], groove["u_included_angle_deg"]
-    yield f"included angle    {angle:.4f} degrees, {u:.5f} standard uncertainty from the points' noise"
+    yield f"included angle    {angle:.4f} degrees, standard uncertainty of noise {u:.5f}"
     yield ""
     yield from table_2_lines(report)
