@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sl_projector.errors import SequenceError, StackError
 from sl_projector.sequence import PatternSequence
 from sl_reconstruct.plan import AxisPlan, DecodePlan
-from sl_reconstruct.reconstruct import make_layout, survey
+from sl_reconstruct.reconstruct import empty_lines, make_layout, survey
 from sl_reconstruct.rows import Lines, decode_rows, row_scratch
 from sl_reconstruct.settings import Settings
 from sl_reconstruct.survey import survey_rows
@@ -145,8 +145,9 @@ def _lines(stack: NDArray[Any], plan: DecodePlan, settings: Settings) -> Lines:
     axis = plan.column
     layout = make_layout(axis, plan.white, plan.black)
     ys = survey_rows(stack.shape[1])
-    tuning, edge_filter, bars, *_ = survey(stack, ys, axis, layout, settings, _empty(ys.size, axis))
-    lines = _empty(stack.shape[1], axis)
+    few = empty_lines(ys.size, axis)
+    tuning, edge_filter, bars, *_ = survey(stack, ys, axis, layout, settings, few)
+    lines = empty_lines(stack.shape[1], axis)
     every = np.arange(stack.shape[1])
     arguments = (stack, layout, edge_filter, tuning, bars, lines)
 
@@ -156,14 +157,6 @@ def _lines(stack: NDArray[Any], plan: DecodePlan, settings: Settings) -> Lines:
 
     share_rows(work, every.size)
     return lines
-
-
-def _empty(rows: int, plan: AxisPlan) -> Lines:
-    shape = (rows, plan.size_px)
-    return Lines(
-        *(np.full(shape, np.nan, np.float32) for _ in range(4)),
-        np.ones(shape, np.uint8), np.zeros((rows, len(plan.sources), 2), np.int32),
-    )  # fmt: skip
 
 
 def _seen(lines: Lines, grid: Array, half_px: int) -> tuple[Array, Array]:
@@ -216,7 +209,8 @@ def _fit_patches(
             continue
         inverse = np.linalg.inv(normal + 1e-9 * np.eye(_TERMS))
         fit = inverse @ right
-        variance = max(0.0, squares - fit @ right) / (n - _TERMS)
+        rest = squares - fit @ right
+        variance = (rest if rest > 0 else 0.0) / (n - _TERMS)
         value[i] = reference + fit[0] - 0.5
         scatter[i] = np.sqrt(variance)
         sigma[i] = np.sqrt(variance * inverse[0, 0])

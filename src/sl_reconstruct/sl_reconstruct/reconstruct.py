@@ -193,15 +193,17 @@ class Reconstructor:
     def _lines(self, key: tuple[Any, ...]) -> Lines:
         """Scratch for so many rows of an axis, made once."""
         if key not in self._scratch:
-            rows, plan = key[0], key[1]
-            u_px, sigma_px, width_px, level_dn = np.full(
-                (4, rows, plan.size_px), np.nan, np.float32
-            )
-            self._scratch[key] = Lines(
-                u_px, sigma_px, width_px, level_dn, np.ones((rows, plan.size_px), np.uint8),
-                np.zeros((rows, len(plan.sources), 2), np.int32),
-            )  # fmt: skip
+            self._scratch[key] = empty_lines(key[0], key[1])
         return self._scratch[key]
+
+
+def empty_lines(rows: int, plan: AxisPlan) -> Lines:
+    """Results of so many rows of an axis, nothing found yet."""
+    u_px, sigma_px, width_px, level_dn = np.full((4, rows, plan.size_px), np.nan, np.float32)
+    return Lines(
+        u_px, sigma_px, width_px, level_dn, np.ones((rows, plan.size_px), np.uint8),
+        np.zeros((rows, len(plan.sources), 2), np.int32),
+    )  # fmt: skip
 
 
 def _screen(settings: Settings, figures: Figures) -> Screen:
