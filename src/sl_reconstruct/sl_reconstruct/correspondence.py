@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sl_projector.errors import SequenceError, StackError
 from sl_projector.sequence import PatternSequence
-from sl_reconstruct.plan import AxisPlan, DecodePlan
+from sl_reconstruct.plan import DecodePlan
 from sl_reconstruct.reconstruct import empty_lines, make_layout, survey
 from sl_reconstruct.rows import Lines, decode_rows, row_scratch
 from sl_reconstruct.settings import Settings
