@@ -13,7 +13,7 @@ from typing import Any
 
 from geometry_msgs.msg import Point, PoseStamped
 from sl_interfaces.msg import MatchedFrame, PatternStack
-from sl_interfaces.srv import MoveStage, Project
+from sl_interfaces.srv import MoveStage
 from std_srvs.srv import Trigger
 
 from sl_calibration.session import RunCancelled, Taken
@@ -21,7 +21,8 @@ from sl_projector.base_node import EVENTS, LARGE, RigNode, next_scan_id
 from sl_projector.errors import CalibrationError, DeviceError, DeviceTimeout, SlError
 from sl_projector.messages import stamp_from_msg
 from sl_reconstruct.messages import stack_from_msg
-from sl_reconstruct.scan_flow import ScanFailed, ScanOrder, ScanRun, ScanTimeouts, ScanWatch
+from sl_reconstruct.projector_client_node import ProjectorClient
+from sl_reconstruct.scan_flow import ScanOrder, ScanRun, ScanTimeouts, ScanWatch
 
 #: A stage that is there answers a question about its travel within this.
 _ANSWER_S = 5.0
@@ -48,8 +49,7 @@ class RigGear:
         group = node.long_work
         self._move = node.create_client(MoveStage, "stage/move", callback_group=group)
         self._stop_stage = node.create_client(Trigger, "stage/stop", callback_group=group)
-        self._project = node.create_client(Project, "projector/project", callback_group=group)
-        self._stop_projector = node.create_client(Trigger, "projector/stop", callback_group=group)
+        self._projector = ProjectorClient(node, group)
         self._watch: ScanWatch | None = None
         self._last_id = 0
         self._cancelled: Callable[[], bool] = lambda: False
@@ -166,9 +166,11 @@ class RigGear:
 
     def halt(self) -> None:
         """Stop stage and projector; their answers are of no interest."""
-        for client in (self._stop_stage, self._stop_projector):
-            if self._node.context.ok() and client.service_is_ready():
-                client.call_async(Trigger.Request())
+        if not self._node.context.ok():
+            return
+        if self._stop_stage.service_is_ready():
+            self._stop_stage.call_async(Trigger.Request())
+        self._projector.stop()
 
     # -- images ---------------------------------------------------------------------------------
 
@@ -221,31 +223,19 @@ class RigGear:
         return gap
 
     def _gap(self) -> str:
-        if not self._project.service_is_ready():
-            return "nobody offers projector/project: is the projector node running?"
+        if gap := self._projector.gap():
+            return gap
         if not self._node.count_publishers("camera/image_raw"):
             return "nobody publishes camera/image_raw: is the camera node running?"
         return ""
 
     def project(self, watch: ScanWatch, order: ScanOrder) -> None:
         """Ask the projector; the watch is told when it has answered."""
-        request = Project.Request(
-            sequence=order.sequence, scan_id=watch.scan_id, exposure_s=order.exposure_s
-        )
-
-        def answered(future: Any) -> None:
-            reply = future.result()
-            watch.answered(reply.success, reply.count, reply.message)
-
-        try:
-            self._project.call_async(request).add_done_callback(answered)
-        except RuntimeError as error:  # rclpy: the context is gone
-            raise ScanFailed(f"the projector cannot be asked: {error}") from error
+        self._projector.project(watch, order)
 
     def stop_projecting(self) -> None:
         """Ask the projector to stop."""
-        if self._stop_projector.service_is_ready():
-            self._stop_projector.call_async(Trigger.Request())
+        self._projector.stop()
 
 
 def _taken(message: Any) -> Taken:

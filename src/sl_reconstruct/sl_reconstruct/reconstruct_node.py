@@ -23,10 +23,8 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 from sl_interfaces.action import Scan
 from sl_interfaces.msg import MatchedFrame, PatternStack, RigCalibration, ScanReport
-from sl_interfaces.srv import Project
 from sl_interfaces.srv import Scan as ScanService
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from sl_projector.base_node import (
     CAMERA_FRAME,
@@ -51,6 +49,7 @@ from sl_reconstruct.messages import (
     rig_to_msg,
     stack_from_msg,
 )
+from sl_reconstruct.projector_client_node import ProjectorClient
 from sl_reconstruct.quality import verdict
 from sl_reconstruct.scan_flow import (
     ScanFailed,
@@ -120,8 +119,7 @@ class ReconstructNode(RigNode):
 
     def _offer_scan(self) -> None:
         group = self.long_work
-        self._project = self.create_client(Project, "projector/project", callback_group=group)
-        self._stop_projector = self.create_client(Trigger, "projector/stop", callback_group=group)
+        self._projector = ProjectorClient(self, group)
         self.create_service(ScanService, "scan", self._serve_scan, callback_group=group)
         self._action = ActionServer(
             self,
@@ -425,8 +423,8 @@ class ReconstructNode(RigNode):
         return gap
 
     def _gap(self) -> str:
-        if not self._project.service_is_ready():
-            return "nobody offers projector/project: is the projector node running?"
+        if gap := self._projector.gap():
+            return gap
         for topic, node in (("camera/image_raw", "camera"), ("synchronizer/stack", "synchronizer")):
             if not self.count_publishers(topic):
                 return f"nobody publishes {topic}: is the {node} node running?"
@@ -436,23 +434,11 @@ class ReconstructNode(RigNode):
 
     def project(self, watch: ScanWatch, order: ScanOrder) -> None:
         """Ask the projector; the watch is told when it has answered."""
-        request = Project.Request(
-            sequence=order.sequence, scan_id=watch.scan_id, exposure_s=order.exposure_s
-        )
-
-        def answered(future: Any) -> None:
-            reply = future.result()
-            watch.answered(reply.success, reply.count, reply.message)
-
-        try:
-            self._project.call_async(request).add_done_callback(answered)
-        except RuntimeError as error:  # rclpy: the context is gone
-            raise ScanFailed(f"the projector cannot be asked: {error}") from error
+        self._projector.project(watch, order)
 
     def stop_projecting(self) -> None:
         """Ask the projector to stop; its answer is of no interest."""
-        if self._stop_projector.service_is_ready():
-            self._stop_projector.call_async(Trigger.Request())
+        self._projector.stop()
 
 
 def _feedback(progress: ScanProgress) -> Any:
