@@ -5,7 +5,6 @@ Import nothing of ROS before `require_ros` has set the environment.
 
 from __future__ import annotations
 
-import itertools
 import os
 import threading
 import time
@@ -15,6 +14,8 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+
+from domains import ReservedDomain
 
 #: Discovery takes up to 2.2 s on a busy machine; whoever waits for it waits longer.
 PATIENCE_S = 15.0
@@ -41,18 +42,6 @@ def wait(predicate: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S)
     pytest.fail(f"waited {timeout_s:g} s for {what}")
 
 
-def _domains() -> Iterator[int]:
-    """A domain for each graph, so that graphs that live at the same time do not meet.
-
-    Below 102, else DDS' ports reach into the range of passing connections.
-    """
-    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-    return itertools.cycle(range(40 + 20 * (worker % 3), 60 + 20 * (worker % 3)))
-
-
-_DOMAINS = _domains()
-
-
 class Graph:
     """Nodes in one executor, and a node of the test's own."""
 
@@ -61,7 +50,8 @@ class Graph:
         from rclpy.executors import SingleThreadedExecutor
 
         self.context = rclpy.Context()
-        self.domain = next(_DOMAINS)
+        self._reserved = ReservedDomain()
+        self.domain = self._reserved.number
         rclpy.init(context=self.context, domain_id=self.domain)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.tester = rclpy.create_node("tester", namespace="sl", context=self.context)
@@ -130,6 +120,7 @@ class Graph:
         self.executor.shutdown()
         self.context.try_shutdown()
         self._thread.join(timeout=10)
+        self._reserved.release()
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import dataclasses
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -509,6 +510,34 @@ def test_run_that_ends_early_without_an_abort_is_reported():
     bench.emulator.receive(bytes.fromhex("00 09 03 00 24 1A 00"))  # a stop from elsewhere
     with pytest.raises(DeviceError, match=r"ended after 0\.\d+ s; expected 5\.500 s"):
         bench.driver.wait()
+    bench.driver.close()
+
+
+class SlowStatusBench(Bench):
+    """The run stands still until its status is asked for, and ends before that is answered."""
+
+    def __init__(self):
+        self.asked = threading.Event()
+        super().__init__()
+        self.recorder.receive = self.receive
+
+    def _edge(self, mirrors, index, start_ns, exposure_s):
+        assert self.asked.wait(10)
+        super()._edge(mirrors, index, start_ns, exposure_s)
+
+    def receive(self, report):
+        if self.emulator.running:
+            self.asked.set()
+            while self.emulator.running:
+                time.sleep(1e-3)
+        return self.emulator.receive(report)
+
+
+def test_run_that_ends_while_its_status_is_under_way_is_not_early():
+    bench = SlowStatusBench()
+    bench.driver.open()
+    run_and_wait(bench, named("paper"), Timing(0.5))  # raises when the run seems too short
+    assert len(bench.edges) == len(named("paper"))
     bench.driver.close()
 
 

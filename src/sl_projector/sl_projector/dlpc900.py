@@ -448,11 +448,13 @@ class Dlpc900:
         self._check_duration(run, ended_ns)
 
     def _poll_until_over(self, port: Dlpc900Port, run: RunInfo, deadline_ns: int) -> int:
-        """Return the time at which the sequencer was first seen at rest."""
+        """Return a time by which the sequencer was at rest."""
         end_ns = run.start_ns + int(run.duration_s * 1e9)
         while not self._stopped.is_set():
+            running = port.read(protocol.MAIN_STATUS)[0] & protocol.MAIN_RUNNING
+            # After the reply, which may be slow: the run may have ended while it was under way.
             now_ns = self._clock.now_ns()
-            if not port.read(protocol.MAIN_STATUS)[0] & protocol.MAIN_RUNNING:
+            if not running:
                 return now_ns
             if now_ns > deadline_ns:
                 self.stop()
