@@ -31,7 +31,7 @@ from sl_interfaces.msg import (  # noqa: E402
     RigCalibration,
 )
 from sl_interfaces.msg import Pattern as PatternMsg  # noqa: E402
-from sl_interfaces.srv import MoveStage, Project, Scan  # noqa: E402
+from sl_interfaces.srv import Measure, MoveStage, Project, Scan  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
 from fake_devices import FakeCamera, FakeProjector, FakeStage, WiredPair  # noqa: E402
@@ -276,6 +276,15 @@ def disordered() -> PatternStack:
 
 def test_a_stack_that_nobody_asked_for_becomes_a_cloud(works: Works) -> None:
     works.expect_plane()
+
+
+def test_the_last_cloud_can_be_measured(works: Works) -> None:
+    works.expect_plane()
+    answer = works.graph.call(Measure, "measure", Measure.Request(kind="plane"))
+    assert answer.success, answer.message
+    slope = dict(zip(answer.names, answer.values, strict=True))["a"]
+    # Over 5 mm and more a tilt shifts the border by the plane's tolerance.
+    assert slope == pytest.approx(SLOPE, abs=PLANE_TOLERANCE_M / 2.5e-3)
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,9 @@ import argparse
 import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sl_bringup.progress import say
 from sl_bringup.report import write_json
@@ -17,79 +16,16 @@ from sl_projector.errors import ConfigError, StackError
 from sl_reconstruct.cloud_reading import read_cloud, read_height_map
 from sl_reconstruct.height_map import make_height_map
 from sl_reconstruct.measure.deviation import map_reference, measure_deviation
-from sl_reconstruct.measure.groove import measure_groove
-from sl_reconstruct.measure.hole import measure_hole
-from sl_reconstruct.measure.planes import PlaneMeasurement, measure_angle, measure_plane
-from sl_reconstruct.measure.profile import ProfileMeasurement, measure_profile, save_profile
-from sl_reconstruct.measure.region import Region, select
+from sl_reconstruct.measure.features import FEATURES, Numbers, Points
+from sl_reconstruct.measure.planes import PlaneMeasurement
+from sl_reconstruct.measure.profile import ProfileMeasurement, save_profile
 from sl_reconstruct.measure.result import Measurement, Tolerance
-from sl_reconstruct.measure.roughness import RoughnessMeasurement, measure_roughness
-from sl_reconstruct.measure.rounds import measure_cylinder, measure_sphere
-from sl_reconstruct.measure.step import measure_step
+from sl_reconstruct.measure.roughness import RoughnessMeasurement
 from sl_reconstruct.measure.x3p import save_x3p
 
 MILLIMETRE_M, MICROMETRE_M = 1e-3, 1e-6
-#: Width of the strip that a section averages, as a part of its length.
-SECTION_WIDTH = 0.01
 #: Measurements told in millimetres; other lengths are told in micrometres.
 IN_MILLIMETRES = ("sphere", "cylinder", "hole")
-
-Points = NDArray[Any]
-Numbers = tuple[float, ...]
-
-
-class Feature(NamedTuple):
-    """An option of the command: what it measures from the numbers behind it (metres)."""
-
-    help: str
-    metavar: str
-    measure: Callable[[Points, Numbers], Measurement]
-
-
-def _angle(points: Points, numbers: Numbers) -> Measurement:
-    if len(numbers) != 8:
-        raise ConfigError(f"--angle with {len(numbers)} numbers; expected two rectangles, so 8")
-    first, second = Region.of(numbers[:4]), Region.of(numbers[4:])
-    return measure_angle(select(points, first), select(points, second))
-
-
-def _groove(points: Points, numbers: Numbers) -> Measurement:
-    if points.ndim != 2:
-        raise StackError("--groove needs an organised cloud; expected cloud.pcd or height.tiff")
-    found = measure_groove(points)
-    if found is None:
-        raise StackError("no groove found; expected two flanks of different slope")
-    return found
-
-
-def _profile(points: Points, numbers: Numbers) -> Measurement:
-    if len(numbers) not in (4, 5):
-        raise ConfigError(f"--profile with {len(numbers)} numbers; expected X0,Y0,X1,Y1[,WIDTH]")
-    x0, y0, x1, y1 = numbers[:4]
-    width = numbers[4] if len(numbers) == 5 else SECTION_WIDTH * math.hypot(x1 - x0, y1 - y0)
-    return measure_profile(points, (x0, y0), (x1, y1), width)
-
-
-RECTANGLE = "X0,Y0,X1,Y1"
-FEATURES: dict[str, Feature] = {
-    "plane": Feature("plane and its flatness", RECTANGLE,
-                     lambda p, n: measure_plane(select(p, Region.of(n)))),
-    "angle": Feature("included angle of two planes", "RECTANGLE,RECTANGLE", _angle),
-    "groove": Feature("included angle of a groove whose flanks are found", "", _groove),
-    "step": Feature("height of a step across x, ISO 5436-1", RECTANGLE,
-                    lambda p, n: measure_step(select(p, Region.of(n)))),
-    "step-y": Feature("height of a step across y", RECTANGLE,
-                      lambda p, n: measure_step(select(p, Region.of(n)), "y")),
-    "sphere": Feature("radius and centre of a sphere", RECTANGLE,
-                      lambda p, n: measure_sphere(select(p, Region.of(n)))),
-    "cylinder": Feature("radius and axis of a cylinder", RECTANGLE,
-                        lambda p, n: measure_cylinder(select(p, Region.of(n)))),
-    "hole": Feature("centre and diameter of the hole in a region", RECTANGLE,
-                    lambda p, n: measure_hole(p, Region.of(n))),
-    "roughness": Feature("areal roughness, ISO 25178", RECTANGLE,
-                         lambda p, n: measure_roughness(p, Region.of(n))),
-    "profile": Feature("section along a line; see --csv", "X0,Y0,X1,Y1[,WIDTH]", _profile),
-}  # fmt: skip
 
 
 def numbers_of(text: str) -> Numbers:

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from sl_bringup.progress import complain, say
 
 SERVICES = (
-    "projector/project", "stage/move", "stage/home", "scan", "scan/_action/send_goal",
+    "projector/project", "stage/move", "stage/home", "scan", "scan/_action/send_goal", "measure",
     "calibration/calibrate", "calibration/calibrate/_action/send_goal",
 )  # fmt: skip
 #: What is missing is said when it has been so for the first wait, and again after the second.

@@ -41,6 +41,7 @@ from sl_projector.base_node import (
 from sl_projector.errors import CalibrationError, ConfigError, SlError, StackError
 from sl_projector.messages import stamp_from_msg
 from sl_reconstruct.calibration_file import Calibration, load_calibration, parse_calibration
+from sl_reconstruct.measure_service_node import MeasureService
 from sl_reconstruct.messages import (
     Stack,
     cloud_to_msg,
@@ -113,6 +114,7 @@ class ReconstructNode(RigNode):
         self.subscribe(MatchedFrame, "synchronizer/frame", self._on_frame, EVENTS)
         self.subscribe(PatternStack, "synchronizer/stack", self._on_stack, LARGE)
         self._offer_scan()
+        self._measuring = MeasureService(self, self.long_work)
         self.add_on_set_parameters_callback(self._on_parameters)
         self._compiler = None if compiled() else compile_apart()
         self._worker.submit(self._warm_up)
@@ -329,6 +331,7 @@ class ReconstructNode(RigNode):
         if not good:
             raise ScanFailed(f"no cloud is published: {'; '.join(reasons)}")
         self._clouds.publish(cloud_to_msg(product.cloud.points, stack.stamps_ns[0], WORLD_FRAME))
+        self._measuring.remember(product.cloud.points, stack.stamps_ns[0])
         done_ns = time.time_ns()
         report = report_to_msg(product, stack)
         report.processing_s = (done_ns - came_ns) * 1e-9

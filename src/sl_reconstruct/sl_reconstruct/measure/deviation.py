@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from scipy import ndimage
 from sl_projector.errors import StackError
 from sl_reconstruct.height_map import HeightMap
 from sl_reconstruct.measure.region import Region, select
-from sl_reconstruct.measure.result import Measurement, uncertainties
+from sl_reconstruct.measure.result import Measurement, Quantity, uncertainties
 from sl_reconstruct.measure.trimmed import trimmed_fit
 
 Array = NDArray[np.float64]
@@ -39,6 +39,14 @@ class DeviationMeasurement(Measurement):
     peak_m: float
     valley_m: float
     deviation_m: NDArray[np.float32]
+
+    value_name: ClassVar[str] = "mean_deviation"
+
+    def _others(self) -> Iterator[Quantity]:
+        nan = float("nan")
+        yield Quantity("form_rms", self.form_rms_m, nan, "m")
+        yield Quantity("peak", self.peak_m, nan, "m")
+        yield Quantity("valley", self.valley_m, nan, "m")
 
 
 def measure_deviation(

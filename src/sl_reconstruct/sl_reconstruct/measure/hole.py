@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from sl_projector.errors import StackError
 from sl_reconstruct.height_map import typical_spacing_m
 from sl_reconstruct.measure.region import Region, Selection
-from sl_reconstruct.measure.result import Fitted, Measurement, uncertainties
+from sl_reconstruct.measure.result import Fitted, Measurement, Quantity, uncertainties
 from sl_reconstruct.measure.roughness import crop
 from sl_reconstruct.measure.rounds import fit_rounds
 from sl_reconstruct.plane_fit import TRIM_SD, fit_plane
@@ -48,16 +49,22 @@ class HoleMeasurement(Measurement):
     u_centre_m: tuple[float, float]
     method: Method
 
+    value_name: ClassVar[str] = "diameter"
 
-def measure_hole(points: NDArray[Any], region: Region) -> HoleMeasurement:
+    def _others(self) -> Iterator[Quantity]:
+        for axis, c, u in zip("xy", self.centre_m, self.u_centre_m, strict=True):
+            yield Quantity(f"centre_{axis}", c, u, "m")
+
+
+def measure_hole(points: NDArray[Any], region: Region | None = None) -> HoleMeasurement:
     """Fit a circle to the edges of the one hole in a region.
 
     Parameters
     ----------
     points : ndarray, (H, K), structured
         Organised cloud with ``intensity``.
-    region : Region
-        Around the hole, with some plate on all sides and no other hole.
+    region : Region, optional
+        Around the hole, with some plate on all sides and no other hole; everywhere when left out.
 
     Raises
     ------
@@ -142,7 +149,7 @@ def _light(points: NDArray[Any]) -> Array:
     return np.asarray(np.where(deep, 0.0, intensity / level))
 
 
-def _round(edges: Array, region: Region) -> tuple[Array, NDArray[np.bool_], Fitted | None]:
+def _round(edges: Array, region: Region | None) -> tuple[Array, NDArray[np.bool_], Fitted | None]:
     """Circle (x, y, radius), edges used and what they tell; no fit where there are too few."""
     if len(edges) < LEAST_EDGES:
         return np.full(3, np.nan), np.zeros(len(edges), np.bool_), None

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_projector.errors import StackError
+from sl_reconstruct.measure.denoise import Corrected, peak_to_valley
 from sl_reconstruct.measure.region import Selection
-from sl_reconstruct.measure.result import Measurement, uncertainties
+from sl_reconstruct.measure.result import Measurement, Quantity, uncertainties
 from sl_reconstruct.plane_fit import TRIM_SD, Plane, fit_plane, robust_sd
 
 Array = NDArray[np.float64]
@@ -18,8 +21,6 @@ Array = NDArray[np.float64]
 FLATNESS_CELLS = 40
 #: A cell speaks when it holds this part of what a cell holds usually.
 FULL_CELL = 0.5
-#: Repetitions that tell how noise widens the flatness.
-DRAWS = 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,8 +28,8 @@ class PlaneMeasurement(Measurement):
     """A plane; the value is its flatness.
 
     The flatness is the peak-to-valley deviation from the least squares plane (ISO 12781-1, FLTt)
-    of means over `FLATNESS_CELLS` squared cells, less what noise adds to it on average. Where the
-    surface is flatter than the noise of the cells it is an upper bound rather than a value.
+    of means over `FLATNESS_CELLS` squared cells, less what noise adds to it on average. Of a
+    surface flatter than the noise of the cells it scatters about 0 and may come out negative.
 
     Parameters
     ----------
@@ -53,6 +54,13 @@ class PlaneMeasurement(Measurement):
     tilts: tuple[tuple[float, ...], ...]
     tilt_covariance: tuple[tuple[float, ...], ...]
 
+    value_name: ClassVar[str] = "flatness"
+
+    def _others(self) -> Iterator[Quantity]:
+        yield Quantity("a", self.a, self.u_a, "1")
+        yield Quantity("b", self.b, self.u_b, "1")
+        yield Quantity("c", self.c_m, self.u_c_m, "m")
+
 
 @dataclass(frozen=True, kw_only=True)
 class AngleMeasurement(Measurement):
@@ -66,6 +74,12 @@ class AngleMeasurement(Measurement):
 
     first: PlaneMeasurement
     second: PlaneMeasurement
+
+    value_name: ClassVar[str] = "included_angle"
+
+    def _others(self) -> Iterator[Quantity]:
+        for side, plane in (("first", self.first), ("second", self.second)):
+            yield from (q._replace(name=f"{side}_{q.name}") for q in plane.quantities())
 
 
 def measure_plane(chosen: Selection) -> PlaneMeasurement:
@@ -156,27 +170,23 @@ def _explicit(plane: Plane, tilts: Array, covariance: Array) -> dict[str, float]
     }  # fmt: skip
 
 
-def _flatness(local_m: Array, distance_m: Array, sigma_m: Array) -> tuple[float, float]:
-    """Peak to valley of cell means less the widening by noise, and its uncertainty.
-
-    The widening is measured by adding the cells' own noise once more (parametric bootstrap).
-    """
+def _flatness(local_m: Array, distance_m: Array, sigma_m: Array) -> Corrected:
+    """Peak to valley of the means of cells, less what their noise adds."""
     side = int(np.clip(np.sqrt(len(distance_m) / 9), 1, FLATNESS_CELLS))
     low, span = local_m.min(axis=0), np.maximum(np.ptp(local_m, axis=0), 1e-30)
     cell = np.minimum((side * (local_m - low) / span).astype(np.int64), side - 1)
     number = cell[:, 0] * side + cell[:, 1]
-    count = np.bincount(number)
+    count = np.bincount(number, minlength=side * side)
+    held = np.maximum(count, 1)
     full = count >= FULL_CELL * len(number) / np.count_nonzero(count)
-    mean = np.bincount(number, distance_m)[full] / count[full]
+    mean = np.bincount(number, distance_m, side * side) / held
     variance = sigma_m**2
     if not variance.any():  # none is stated: the scatter within the cells, form included
-        inside = distance_m - (np.bincount(number, distance_m) / np.maximum(count, 1))[number]
+        inside = distance_m - mean[number]
         variance = inside**2 * len(inside) / max(len(inside) - np.count_nonzero(count), 1)
-    noise = np.sqrt(np.bincount(number, variance)[full]) / count[full]
-    found = float(np.ptp(mean))
-    draws = np.random.default_rng(0).standard_normal((DRAWS, len(mean))) * noise + mean
-    again = np.ptp(draws, axis=1)
-    return max(0.0, 2.0 * found - float(again.mean())), float(again.std())
+    noise = np.sqrt(np.bincount(number, variance, side * side)) / held
+    grid = (side, side)
+    return peak_to_valley(mean.reshape(grid), noise.reshape(grid), full.reshape(grid))
 
 
 def _three(vector: Array) -> tuple[float, float, float]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_projector.documents import written_atomically
 from sl_projector.errors import ConfigError, StackError
+from sl_reconstruct.measure.denoise import peak_to_valley
 from sl_reconstruct.measure.region import Region, select
 from sl_reconstruct.measure.result import Measurement
 
@@ -24,7 +25,7 @@ SCATTER_POINTS = 5
 
 @dataclass(frozen=True, kw_only=True)
 class ProfileMeasurement(Measurement):
-    """A section; the value is its total height, highest less lowest.
+    """A section; the value is its total height, highest less lowest bin, less what noise adds.
 
     Parameters
     ----------
@@ -39,6 +40,8 @@ class ProfileMeasurement(Measurement):
     along_m: Array
     z_m: Array
     u_z_m: Array
+
+    value_name: ClassVar[str] = "height"
 
 
 def measure_profile(
@@ -89,11 +92,11 @@ def measure_profile(
     z, s, u = z[there], s[there], u[there]
     if len(z) < 2:
         raise StackError("a section needs at least two bins with points; expected a longer line")
-    high, low = int(np.argmax(z)), int(np.argmin(z))
+    total = peak_to_valley(z, u, np.isfinite(z))
     residual = chosen.xyz_m[:, 2] - np.interp(along, s, z)
     return ProfileMeasurement(
-        kind="profile", value=float(z[high] - z[low]), uncertainty=float(np.hypot(u[high], u[low])),
-        unit="m", points=len(chosen), set_aside=0, rms_m=float(np.sqrt(np.mean(residual**2))),
+        kind="profile", value=total.value, uncertainty=total.uncertainty, unit="m",
+        points=len(chosen), set_aside=0, rms_m=float(np.sqrt(np.mean(residual**2))),
         dof=len(chosen) - len(z), inflation=1.0, region=region, from_m=from_m, to_m=to_m,
         along_m=s, z_m=z, u_z_m=u,
     )  # fmt: skip

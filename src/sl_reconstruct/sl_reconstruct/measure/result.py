@@ -10,8 +10,9 @@ covers noise and form; it does not cover the calibration, which shifts and bends
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,15 @@ BLOCKS, BLOCK_POINTS = 10, 25
 SIGNIFICANT = 2.0
 #: One-sided 95 %: the guard band of ISO 14253-1:2017 in standard uncertainties.
 GUARD = 1.6449
+
+
+class Quantity(NamedTuple):
+    """One quantity of a measurement; NaN where its standard uncertainty is not known."""
+
+    name: str
+    value: float
+    uncertainty: float
+    unit: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +74,17 @@ class Measurement:
     dof: int
     inflation: float
     region: Region | None
+
+    #: What the value is called.
+    value_name: ClassVar[str] = "value"
+
+    def quantities(self) -> tuple[Quantity, ...]:
+        """All that was measured, the value first."""
+        return (Quantity(self.value_name, self.value, self.uncertainty, self.unit), *self._others())
+
+    def _others(self) -> Iterator[Quantity]:
+        """Quantities beside the value; a kind that has some says them."""
+        yield from ()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values by name, for files."""

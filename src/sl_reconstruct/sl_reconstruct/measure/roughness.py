@@ -5,24 +5,28 @@ docs/decisions/0007 says why that library, and which of its parameters are used.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_projector.errors import ConfigError, StackError
 from sl_reconstruct.height_map import HeightMap, make_height_map
+from sl_reconstruct.measure.denoise import Corrected, estimate, fill, take_off
 from sl_reconstruct.measure.region import Region
-from sl_reconstruct.measure.result import Measurement
+from sl_reconstruct.measure.result import Measurement, Quantity
 
 Array = NDArray[np.float64]
 
 #: Height parameters in metres, and those without unit (Sdr as a ratio, not percent).
 LENGTHS = ("Sa", "Sq", "Sp", "Sv", "Sz")
 NUMBERS = ("Ssk", "Sku", "Sdr", "Sdq")
-#: Repetitions of the points' noise, each with both signs, that tell bias and uncertainty.
-PAIRS = 16
+#: Parameters to which noise adds as variances do.
+SQUARES = ("Sa", "Sq", "Sp", "Sv", "Sz", "Sdq")
+#: Repetitions of the points' noise that tell bias and uncertainty.
+DRAWS = 48
 MICROMETRE_M = 1e-6
 
 
@@ -45,6 +49,13 @@ class RoughnessMeasurement(Measurement):
     corrected: dict[str, float]
     uncertainties: dict[str, float]
     step_m: float
+
+    value_name: ClassVar[str] = "Sq"
+
+    def _others(self) -> Iterator[Quantity]:
+        for name in (n for n in self.corrected if n != "Sq"):
+            unit = "m" if name in LENGTHS else "1"
+            yield Quantity(name, self.corrected[name], self.uncertainties[name], unit)
 
 
 def measure_roughness(
@@ -71,16 +82,15 @@ def measure_roughness(
     Notes
     -----
     The points' noise adds to every parameter. It is drawn again from the stated sigmas, put
-    through the same map, and what it adds is taken off (parametric bootstrap); Sz, Sp and Sv keep
-    some of it. Points without sigma give no uncertainty (NaN).
+    through the same map onto an estimate of the surface without noise, and what it adds is taken
+    off (`sl_reconstruct.measure.denoise`). Points without sigma give no uncertainty (NaN).
     """
     cut = crop(points, region)
     height = make_height_map(cut, step_m)
     raw = areal_parameters(height.z_m, height.step_m)
-    drawn = _again(cut, height, raw)
-    bias = {name: float(np.mean(values)) - raw[name] for name, values in drawn.items()}
-    spread = {name: float(np.std(values, ddof=1)) for name, values in drawn.items()}
-    corrected = {name: _less(name, raw[name], bias[name]) for name in raw}
+    found = _corrected(cut, height, raw)
+    corrected = {name: one.value for name, one in found.items()}
+    spread = {name: one.uncertainty for name, one in found.items()}
     count = int(np.count_nonzero(np.isfinite(height.z_m)))
     return RoughnessMeasurement(
         kind="roughness", value=corrected["Sq"], uncertainty=spread["Sq"], unit="m",
@@ -171,31 +181,42 @@ def _without_border(z: Array) -> Array:
     raise StackError("too few heights for roughness; expected a region of at least 3 x 3 nodes")
 
 
-def _again(
+def _corrected(
     points: NDArray[Any], height: HeightMap, raw: dict[str, float]
-) -> dict[str, list[float]]:
-    """Parameters with the points' noise added once more, many times."""
+) -> dict[str, Corrected]:
+    """Parameters less what the points' noise adds to them."""
     names = points.dtype.names or ()
     sigma = points["sigma"] if "sigma" in names else np.zeros(points.shape, np.float32)
     if not np.nanmax(np.where(np.isfinite(points["z"]), sigma, 0.0), initial=0.0) > 0.0:
-        return {name: [float("nan")] * 2 for name in raw}
+        return {name: Corrected(value, float("nan")) for name, value in raw.items()}
+    noise = _noise_maps(points, sigma, height)
+    inner = _levelled(fill(_without_border(np.asarray(height.z_m, dtype=np.float64))))
+    clean = estimate(inner, noise)
+    told = areal_parameters(clean, height.step_m)
+    drawn = [areal_parameters(clean + draw, height.step_m) for draw in noise]
+    return {
+        name: take_off(raw[name], told[name], np.array([one[name] for one in drawn]),
+                       name in SQUARES)
+        for name in raw
+    }  # fmt: skip
+
+
+def _noise_maps(points: NDArray[Any], sigma: NDArray[Any], height: HeightMap) -> Array:
+    """Draws of the points' noise alone, (DRAWS, rows, columns) of the map without its border."""
     rng = np.random.default_rng(0)
-    drawn: dict[str, list[float]] = {name: [] for name in raw}
-    for _ in range(PAIRS):
+    alone = points.copy()
+    maps = []
+    for _ in range(DRAWS):
         noise = sigma * rng.standard_normal(points.shape, np.float32)
-        for signed in (noise, -noise):
-            noisy = points.copy()
-            noisy["z"] += signed
-            found = areal_parameters(make_height_map(noisy, height.step_m).z_m, height.step_m)
-            for name, value in found.items():
-                drawn[name].append(value)
-    return drawn
+        alone["z"] = np.where(np.isfinite(points["z"]), noise, np.nan)
+        z = make_height_map(alone, height.step_m).z_m
+        maps.append(fill(_without_border(np.asarray(z, dtype=np.float64))))
+    return np.stack(maps)
 
 
-def _less(name: str, raw: float, bias: float) -> float:
-    """Take off what noise adds: variances add, so in squares, but for Sdr and the shapes."""
-    if np.isnan(bias):
-        return raw
-    if name in ("Ssk", "Sku", "Sdr"):
-        return raw - bias
-    return float(np.sqrt(max(0.0, 2.0 * raw**2 - (raw + bias) ** 2)))
+def _levelled(z: Array) -> Array:
+    """Heights without their least squares plane; none may be missing."""
+    v, u = np.indices(z.shape)
+    design = np.column_stack([u.ravel(), v.ravel(), np.ones(z.size)])
+    plane = np.linalg.lstsq(design, z.ravel(), rcond=None)[0]
+    return np.asarray(z - (design @ plane).reshape(z.shape))

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_projector.errors import StackError
 from sl_reconstruct.measure.region import Selection
-from sl_reconstruct.measure.result import Measurement, uncertainties
+from sl_reconstruct.measure.result import Measurement, Quantity, uncertainties
 from sl_reconstruct.plane_fit import TRIM_SD, robust_sd
 
 Array = NDArray[np.float64]
@@ -35,6 +36,12 @@ class SphereMeasurement(Measurement):
     centre_m: tuple[float, ...]
     u_centre_m: tuple[float, ...]
 
+    value_name: ClassVar[str] = "radius"
+
+    def _others(self) -> Iterator[Quantity]:
+        for axis, c, u in zip("xyz", self.centre_m, self.u_centre_m, strict=True):
+            yield Quantity(f"centre_{axis}", c, u, "m")
+
 
 @dataclass(frozen=True, kw_only=True)
 class CylinderMeasurement(Measurement):
@@ -50,6 +57,8 @@ class CylinderMeasurement(Measurement):
 
     point_m: tuple[float, ...]
     direction: tuple[float, ...]
+
+    value_name: ClassVar[str] = "radius"
 
 
 def measure_sphere(chosen: Selection) -> SphereMeasurement:

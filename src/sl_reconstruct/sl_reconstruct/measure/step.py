@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,8 @@ class StepMeasurement(Measurement):
     axis: Axis
     slope_x: float
     slope_y: float
+
+    value_name: ClassVar[str] = "step_height"
 
 
 def measure_step(

@@ -1,0 +1,115 @@
+"""A measurement as it is asked for in one piece, with reference and tolerance, and its answer."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from sl_projector.errors import ConfigError
+from sl_reconstruct.cloud_reading import read_height_map
+from sl_reconstruct.measure.deviation import map_reference, measure_deviation
+from sl_reconstruct.measure.features import Numbers, Points, measure_feature
+from sl_reconstruct.measure.region import Region
+from sl_reconstruct.measure.result import Measurement, Quantity, Tolerance, Verdict
+
+#: The one kind that needs a file beside the cloud, so it is not among `FEATURES`.
+DEVIATION = "deviation"
+
+
+@dataclass(frozen=True)
+class Order:
+    """What to measure.
+
+    Parameters
+    ----------
+    kind : str
+        One of `features.FEATURES`, or "deviation".
+    region_m : tuple of float
+        As the kind wants it, metres; empty is everywhere.
+    reference_file : str
+        Of a deviation: height map with its report.
+    level : bool
+        Of a deviation: take offset and tilt out.
+    quantity : str
+        Which quantity the tolerance is for; empty is the first.
+    tolerance : tuple of float
+        (low, high) in the quantity's unit; empty: no verdict.
+    """
+
+    kind: str
+    region_m: Numbers = ()
+    reference_file: str = ""
+    level: bool = False
+    quantity: str = ""
+    tolerance: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.tolerance) not in (0, 2):
+            raise ConfigError(f"tolerance {list(self.tolerance)}; expected [low, high] or nothing")
+        if not all(math.isfinite(number) for number in self.region_m):
+            raise ConfigError(f"region {list(self.region_m)}; expected finite numbers")
+        if self.kind == DEVIATION and not self.reference_file:
+            raise ConfigError("a deviation without reference_file; expected a height.tiff")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What was measured.
+
+    Parameters
+    ----------
+    found : Measurement
+        The measurement.
+    quantities : tuple of Quantity
+        All its quantities, the value first.
+    verdict : {"pass", "fail", "undecided", ""}
+        On the tolerance; empty where none was told.
+    """
+
+    found: Measurement
+    quantities: tuple[Quantity, ...]
+    verdict: Verdict | Literal[""]
+
+    @property
+    def text(self) -> str:
+        """One line a person can act on."""
+        first, found = self.quantities[0], self.found
+        unit = "" if first.unit == "1" else f" {first.unit}"
+        verdict = f"; tolerance: {self.verdict}" if self.verdict else ""
+        return (
+            f"{first.name} {first.value:.9g} ± {first.uncertainty:.2g}{unit} (k = 1) from "
+            f"{found.points} points{verdict}"
+        )
+
+
+def carry_out(order: Order, points: Points) -> Answer:
+    """Measure a cloud.
+
+    Raises
+    ------
+    ConfigError
+        When the order cannot be carried out on any cloud.
+    StackError
+        When this cloud does not hold the feature.
+    """
+    # A wrong tolerance is told before the measurement takes its time.
+    limits = Tolerance(*order.tolerance) if order.tolerance else None
+    found = _measure(order, points)
+    quantities = found.quantities()
+    named = {quantity.name: quantity for quantity in quantities}
+    if order.quantity and order.quantity not in named:
+        raise ConfigError(
+            f"{order.kind} has no quantity {order.quantity!r}; expected one of {', '.join(named)}"
+        )
+    judged = named[order.quantity] if order.quantity else quantities[0]
+    verdict = limits.verdict(judged.value, judged.uncertainty) if limits else ""
+    return Answer(found, quantities, verdict)
+
+
+def _measure(order: Order, points: Points) -> Measurement:
+    if order.kind != DEVIATION:
+        return measure_feature(order.kind, points, order.region_m)
+    reference = map_reference(read_height_map(order.reference_file))
+    region = Region.of(order.region_m) if order.region_m else None
+    return measure_deviation(points, reference, region, order.level)
