@@ -56,13 +56,16 @@ TOPICS = (TRIGGER, IMAGE, POSE, CALIBRATION)
 
 CAMERA_INFO = Topic("camera/camera_info", "sensor_msgs/msg/CameraInfo")
 PROJECTOR_INFO = Topic("projector/camera_info", "sensor_msgs/msg/CameraInfo", latched=True)
+#: How the camera was set, and where its pixels end (JSON).
+CAMERA_SETTINGS = Topic("camera/settings", "std_msgs/msg/String", latched=True)
 #: What the live graph made of it: verdicts of the matching, results, settings.
 FRAME = Topic("synchronizer/frame", "sl_interfaces/msg/MatchedFrame")
 REPORT = Topic("reconstruct/report", "sl_interfaces/msg/ScanReport")
 SETTINGS = Topic("reconstruct/settings", "std_msgs/msg/String", latched=True)
+MATCHING = Topic("synchronizer/settings", "std_msgs/msg/String", latched=True)
 #: What comes from the devices, and what `slrig record` records.
-RAW_TOPICS = (TRIGGER, IMAGE, CAMERA_INFO, POSE, CALIBRATION, PROJECTOR_INFO)
-RECORDED_TOPICS = (*RAW_TOPICS, FRAME, REPORT, SETTINGS)
+RAW_TOPICS = (TRIGGER, IMAGE, CAMERA_INFO, POSE, CALIBRATION, PROJECTOR_INFO, CAMERA_SETTINGS)
+RECORDED_TOPICS = (*RAW_TOPICS, FRAME, REPORT, SETTINGS, MATCHING)
 
 DEFAULT_NAMESPACE = "/sl"
 

@@ -17,7 +17,9 @@ OF_MATCHING = {f.name for f in fields(MatcherSettings)}
 
 
 def parse_choices(
-    assignments: Sequence[str], base: Settings | None = None
+    assignments: Sequence[str],
+    base: Settings | None = None,
+    matching: MatcherSettings | None = None,
 ) -> tuple[Settings, MatcherSettings]:
     """Read ``name=value`` assignments: settings of the reconstruction and of the matching.
 
@@ -27,6 +29,8 @@ def parse_choices(
         What is changed; the last one counts.
     base : Settings, optional
         What is changed of the reconstruction; the defaults when left out.
+    matching : MatcherSettings, optional
+        What is changed of the matching; the defaults when left out.
 
     Raises
     ------
@@ -44,16 +48,20 @@ def parse_choices(
             )
         values[name] = _value(text)
     try:
-        return _made(values, base or Settings())
+        return _made(values, base or Settings(), matching or MatcherSettings())
     except (TypeError, ConfigError) as exc:
         raise ConfigError(f"{' '.join(assignments)}: {exc}") from None
 
 
-def _made(values: Mapping[str, Any], base: Settings) -> tuple[Settings, MatcherSettings]:
-    changes = {k: v for k, v in values.items() if k in OF_SETTINGS}
-    settings = Settings.from_dict({**base.to_dict(), **changes})
-    matching = MatcherSettings(**{k: v for k, v in values.items() if k in OF_MATCHING})
-    return settings, matching
+def _made(
+    values: Mapping[str, Any], base: Settings, matching: MatcherSettings
+) -> tuple[Settings, MatcherSettings]:
+    of_settings = {k: v for k, v in values.items() if k in OF_SETTINGS}
+    of_matching = {k: v for k, v in values.items() if k in OF_MATCHING}
+    return (
+        Settings.from_dict({**base.to_dict(), **of_settings}),
+        MatcherSettings.from_dict({**matching.to_dict(), **of_matching}),
+    )
 
 
 def _value(text: str) -> Any:

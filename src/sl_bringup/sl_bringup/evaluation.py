@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from sl_bringup.bags import TRIGGER, Bag, open_bag, topic_names
 from sl_bringup.calibrations import Calibrations, InForce
 from sl_bringup.choices import parse_choices
-from sl_bringup.live_results import LiveResults, recorded_settings
+from sl_bringup.live_results import LiveResults
+from sl_bringup.recorded_settings import read_settings
 from sl_bringup.report import write_json, write_page
 from sl_bringup.result_folder import clear_results, write_summary
 from sl_bringup.scan_files import write_scan
@@ -31,6 +32,7 @@ from sl_camera.matching import FrameDecision, MatchedStack, StackMatcher, Status
 from sl_projector.errors import BagError, CalibrationError, SlError
 from sl_reconstruct.cloud import Cloud
 from sl_reconstruct.cloud_files import cloud_hash
+from sl_reconstruct.full_scale import saturation_of
 from sl_reconstruct.quality import verdict
 from sl_reconstruct.settings import Settings
 from sl_reconstruct.workshop import Workshop
@@ -157,14 +159,16 @@ class _BagRun:
 
     def __init__(self, bag: Bag, output: Path, choices: Choices, crew: Crew) -> None:
         self._bag, self._output, self._choices, self._crew = bag, output, choices, crew
-        recorded, note = recorded_settings(bag)
-        if note:
-            bag.notes.append(note)
-        self._settings, matching = parse_choices(choices.assignments, recorded)
+        self._recorded = read_settings(bag)
+        self._notes(self._recorded.notes)
+        settings, matching = parse_choices(
+            choices.assignments, self._recorded.of(""), self._recorded.matching
+        )
+        self._notes(self._recorded.differences(settings, matching))
         self._matcher = StackMatcher(matching)
         self._calibrations = Calibrations(bag, choices.calibration)
         self._live = LiveResults(bag)
-        self._workshops = Workshops(self._settings)
+        self._workshops = Workshops()
         self._names: list[int] = []
 
     def run(self) -> list[Report]:
@@ -194,11 +198,12 @@ class _BagRun:
         report = future.result()
         if decision.stack is not None:
             self._matcher.recycle(decision.stack)
-        for note in report.get("notes", ()):
-            if note not in self._bag.notes:
-                self._bag.notes.append(note)
+        self._notes(report.get("notes", ()))
         self._crew.step()
         return report
+
+    def _notes(self, lines: Iterable[str]) -> None:
+        self._bag.notes += [line for line in lines if line not in self._bag.notes]
 
     def _folder_name(self, scan_id: int) -> str:
         """Name by the scan's number; a number that came before gets a suffix."""
@@ -208,6 +213,7 @@ class _BagRun:
 
     def _evaluate(self, decision: FrameDecision, folder: Path, first: bool) -> Report:
         """Report on one verdict; a scan that cannot be evaluated is reported, not raised."""
+        settings = self._settings_of(decision.scan_id)
         report = {
             "format": 1,
             "bag": self._bag.path.name,
@@ -218,13 +224,14 @@ class _BagRun:
             "reasons": [decision.reason] if decision.reason else [],
             "sequence": "",
             "software": software_version(),
-            "settings": self._settings.to_dict(),
-            "settings_hash": self._settings.hash(),
+            "settings": settings.to_dict(),
+            "settings_hash": settings.hash(),
+            "matching": self._matcher.settings.to_dict(),
         }
         cloud = None
         if decision.stack is not None:
             try:
-                cloud = self._measure(report, decision.stack)
+                cloud = self._measure(report, decision.stack, settings)
             except CalibrationError:
                 raise
             except SlError as exc:
@@ -232,11 +239,19 @@ class _BagRun:
         self._write(folder, report, cloud, first)
         return report
 
-    def _measure(self, report: Report, stack: MatchedStack) -> Cloud:
+    def _settings_of(self, scan_id: int) -> Settings:
+        """Settings of a scan: its live cloud's where the recording has them, with the changes."""
+        recorded = self._recorded.of(self._live.settings_hash(scan_id))
+        return parse_choices(self._choices.assignments, recorded)[0]
+
+    def _measure(self, report: Report, stack: MatchedStack, settings: Settings) -> Cloud:
         """Reconstruct a stack and put what was found into the report."""
         in_force = self._calibrations.of(stack)
         report.update(_origin(stack, in_force))
-        cloud = self._workshops.of(in_force)(stack.data, stack.sequence).cloud
+        report["saturation_dn"] = saturation_of(stack.data, settings)
+        notes = in_force.mismatch, _guessed(stack, settings, report["saturation_dn"])
+        report["notes"] = [note for note in notes if note]
+        cloud = self._workshops.of(in_force, settings)(stack.data, stack.sequence).cloud
         report.update(_result(cloud))
         report["live"] = self._live.compare(report)
         return cloud
@@ -252,25 +267,21 @@ class _BagRun:
 
 
 class Workshops:
-    """A workshop for each calibration, so that scans of two of them do not disturb each other.
+    """A workshop for each calibration and settings, so that scans of two do not disturb each other.
 
-    Parameters
-    ----------
-    settings : Settings
-        Of the reconstruction.
+    The workshops that were used last are kept.
     """
 
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
+    def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._made: OrderedDict[str, Workshop] = OrderedDict()
+        self._made: OrderedDict[tuple[str, str], Workshop] = OrderedDict()
 
-    def of(self, in_force: InForce) -> Workshop:
-        """Workshop with this calibration in force."""
+    def of(self, in_force: InForce, settings: Settings) -> Workshop:
+        """Workshop with this calibration in force, and these settings."""
         with self._lock:
-            key = in_force.calibration.hash
+            key = in_force.calibration.hash, settings.hash()
             if key not in self._made:
-                self._made[key] = Workshop(self._settings)
+                self._made[key] = Workshop(settings)
                 self._made[key].calibrate(in_force.calibration)
             self._made.move_to_end(key)
             while len(self._made) > MAX_WORKSHOPS:
@@ -280,7 +291,7 @@ class Workshops:
 
 def _origin(stack: MatchedStack, in_force: InForce) -> Report:
     count, height, width = stack.data.shape
-    found: Report = {
+    return {
         "sequence": stack.sequence.name,
         "dmd_size": stack.sequence.dmd_size,
         "images": f"{count} of {width} x {height}, {stack.encoding}",
@@ -289,7 +300,16 @@ def _origin(stack: MatchedStack, in_force: InForce) -> Report:
         "calibration_hash": in_force.calibration.hash,
         "calibration_source": in_force.source,
     }
-    return {**found, "notes": [in_force.mismatch]} if in_force.mismatch else found
+
+
+def _guessed(stack: MatchedStack, settings: Settings, saturation_dn: int) -> str:
+    """Say where saturation begins when only the values show it; empty when it is known."""
+    if settings.saturation_dn or stack.encoding == "mono8":
+        return ""
+    return (
+        "nothing says how many of the 16 bits the camera used; as the values show, pixels count "
+        f"as saturated from {saturation_dn} DN on (--set saturation_dn=N says otherwise)"
+    )
 
 
 def _result(cloud: Cloud) -> Report:

@@ -2,33 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any
 
-from sl_bringup.bags import REPORT, SETTINGS, Bag
-from sl_projector.errors import BagError, ConfigError
-from sl_reconstruct.settings import Settings
-
-
-def recorded_settings(bag: Bag) -> tuple[Settings | None, str]:
-    """Settings that the live clouds were made with, last ones first; and why there are none.
-
-    Returns
-    -------
-    settings : Settings or None
-        None where the bag has none that can be used: the defaults hold then.
-    note : str
-        Empty, or what is wrong with those in the bag.
-    """
-    if not bag.has(SETTINGS):
-        return None, ""
-    try:
-        texts = [recorded.message.data for recorded in bag.messages(SETTINGS, quick=True)]
-        return (Settings.from_dict(json.loads(texts[-1])) if texts else None), ""
-    except (BagError, ConfigError, ValueError, TypeError) as exc:
-        return None, f"the settings in the bag cannot be used, the defaults hold: {exc}"
+from sl_bringup.bags import REPORT, Bag
 
 
 class LiveResults:
@@ -45,6 +23,11 @@ class LiveResults:
         if bag.has(REPORT):
             for recorded in bag.messages(REPORT, quick=True):
                 self._reports[recorded.message.scan_id].append(recorded.message)
+
+    def settings_hash(self, scan_id: int) -> str:
+        """Settings of the scan's live cloud; empty where there is none."""
+        live = self._reports.get(scan_id, [])
+        return str(live[-1].settings_hash) if live else ""
 
     def compare(self, report: Mapping[str, Any]) -> dict[str, Any]:
         """Compare a scan's report with the live one.

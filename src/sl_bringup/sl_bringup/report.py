@@ -87,7 +87,9 @@ def _sections(report: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]
     origin = [
         ("Sequence", str(report["sequence"])),
         ("Images", str(report.get("images", "-"))),
+        ("Saturated from", f"{report['saturation_dn']} DN" if "saturation_dn" in report else "-"),
         ("Calibration", str(report.get("calibration_source", "-"))),
+        ("Live cloud", str(report.get("live", {}).get("told", "-"))),
         *((key.replace("_", " ").capitalize(), value) for key, value in _hashes(report)),
     ]
     sections = [("Origin", origin)]

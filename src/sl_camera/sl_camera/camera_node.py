@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import replace
+from dataclasses import asdict, replace
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -71,6 +71,7 @@ class CameraNode(RigNode):
         self._calibrated: CameraInfo | None = None
         self._calibrated_ns = 0
         self._full_scale_dn = 0
+        self._tell_settings = self.latch_settings("camera/settings")
         self._statistics = CameraStatistics()
         self._orders: SimpleQueue[tuple[CameraSettings, Future[None]]] = SimpleQueue()
         self._stop = threading.Event()
@@ -204,10 +205,16 @@ class CameraNode(RigNode):
             except DeviceError as error:
                 self.complain("camera/image_raw", error)
                 return
-        self._full_scale_dn = frame.full_scale_dn
+        self._tell(self._settings, frame.full_scale_dn)
         image = image_to_msg(frame.image, frame.stamp_ns, CAMERA_FRAME)
         self._images.publish(image)
         self._infos.publish(camera_info_for(self._calibrated, image))
+
+    def _tell(self, settings: CameraSettings, full_scale_dn: int) -> None:
+        """Latch how the camera is set and, once a frame shows it, where its pixels end."""
+        if (settings, full_scale_dn) != (self._settings, self._full_scale_dn):
+            self._settings, self._full_scale_dn = settings, full_scale_dn
+            self._tell_settings({**asdict(settings), "full_scale_dn": full_scale_dn})
 
     def _on_calibration(self, message: RigCalibration) -> None:
         """Take the calibration that came in force last; several nodes latch one."""
@@ -260,7 +267,7 @@ class CameraNode(RigNode):
         if self._link.connected:
             fault = self._configure(self._link.device(), settings)
         if fault is None:
-            self._settings = settings
+            self._tell(settings, self._full_scale_dn)
             order.set_result(None)
         else:
             order.set_exception(fault)

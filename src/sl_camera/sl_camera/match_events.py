@@ -6,7 +6,8 @@ Plain data, no ROS: `synchronizer_node` makes it from messages, `slrig evaluate`
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from enum import IntEnum
 from typing import Any, TypeAlias
 
@@ -283,3 +284,24 @@ class MatcherSettings:
                 raise ConfigError(f"{name}={value}; expected a positive number")
         if not math.isfinite(self.clock_offset_s):
             raise ConfigError(f"clock_offset_s={self.clock_offset_s}; expected a number")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values by name, for files."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> MatcherSettings:
+        """Return the settings of ``to_dict``; missing ones keep their defaults.
+
+        Raises
+        ------
+        ConfigError
+            When a name is unknown or a value cannot be used.
+        """
+        known = [f.name for f in fields(cls)]
+        if unknown := sorted(set(values) - set(known)):
+            raise ConfigError(f"unknown settings {unknown}; expected some of {known}")
+        try:
+            return cls(**values)
+        except TypeError as error:
+            raise ConfigError(f"a setting has the wrong type: {error}") from error

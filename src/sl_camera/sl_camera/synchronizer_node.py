@@ -25,6 +25,7 @@ class SynchronizerNode(RigNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("synchronizer", **options)
         self._matcher = StackMatcher(self._declare_settings())
+        self.latch_settings("synchronizer/settings")(self._matcher.settings.to_dict())
         self._last_verdict = "none yet"
         self._frames = self.create_publisher(MatchedFrame, "synchronizer/frame", EVENTS)
         self._stacks = self.create_publisher(PatternStack, "synchronizer/stack", LARGE)
@@ -88,6 +89,8 @@ class SynchronizerNode(RigNode):
                 self.get_logger().warning(f"scan {decision.scan_id}: {decision.reason}")
             if decision.status in (Status.STACK_COMPLETE, Status.STACK_REFUSED):
                 self._last_verdict = f"scan {decision.scan_id}: {decision.reason or 'complete'}"
+            if decision.status is Status.STACK_REFUSED:
+                self.note(self._last_verdict)
         if self._matcher.busy == self._ticks.is_canceled():
             self._ticks.reset() if self._matcher.busy else self._ticks.cancel()
 

@@ -6,10 +6,11 @@ what is wrong with one becomes a count, a log line and a reply.
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -24,6 +25,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
+from std_msgs.msg import String
 
 from sl_projector.errors import SlError
 
@@ -124,6 +126,15 @@ class RigNode(Node):  # type: ignore[misc]  # rclpy carries no types
     def close(self) -> None:
         """Give back what the node holds; called once, after the executor has stopped."""
         self.workers.shutdown(wait=True, cancel_futures=True)
+
+    def latch_settings(self, topic: str) -> Callable[[Mapping[str, object]], None]:
+        """Return what publishes settings on a latched topic, as JSON: recordings then hold them."""
+        publisher = self.create_publisher(String, topic, LATCHED)
+
+        def tell(values: Mapping[str, object]) -> None:
+            publisher.publish(String(data=json.dumps(values, sort_keys=True)))
+
+        return tell
 
     def declare(
         self,

@@ -16,6 +16,7 @@ from sl_reconstruct.cloud import CLOUD_DTYPE, Cloud, Figures, count_reasons
 from sl_reconstruct.crossed import Crossed, cross_rows, map_rows
 from sl_reconstruct.edges import Filter, Tuning
 from sl_reconstruct.filters import edge_filter, gaussian_taps, tap_variance
+from sl_reconstruct.full_scale import saturation_of
 from sl_reconstruct.geometry import geometry, ray_row
 from sl_reconstruct.plan import AxisPlan, DecodePlan
 from sl_reconstruct.points import Output, Screen, triangulate_rows
@@ -129,8 +130,10 @@ class Reconstructor:
             )
 
     def _reconstruct(self, stack: NDArray[Any]) -> Cloud:
-        column = self.plan.column
-        _, lines, figures = self._decode(stack, column, self.plan.white, self.plan.black)
+        column, saturation = self.plan.column, saturation_of(stack, self.settings)
+        _, lines, figures = self._decode(
+            stack, column, self.plan.white, self.plan.black, saturation
+        )
         out = _output(*lines.u_px.shape)
         columns = np.arange(column.size_px, dtype=np.float64) - 0.5
         screen = _screen(self.settings, figures)
@@ -140,18 +143,19 @@ class Reconstructor:
             triangulate_rows(first, last, self._geometry, columns, lines, screen, out, *scratch)
 
         share_rows(work, stack.shape[1])
-        crossed = self._cross(stack, lines, columns, out) if self.plan.row else None
+        crossed = self._cross(stack, lines, columns, out, saturation) if self.plan.row else None
         refused, lit = count_reasons(out.reason)
         extra = crossed[1:] if crossed else ()
         points = out.values.view(CLOUD_DTYPE)[..., 0]
         return Cloud(points, out.u_px, out.reason, refused, lit, figures, *extra)
 
     def _cross(
-        self, stack: NDArray[Any], lines: Lines, columns: NDArray[np.float64], out: Output
-    ) -> Crossed:
+        self, stack: NDArray[Any], lines: Lines, columns: NDArray[np.float64], out: Output,
+        saturation: int,
+    ) -> Crossed:  # fmt: skip
         """Decode the rows, and solve again with all four equations."""
         plan, white, black, turned = turn(self.plan, stack)
-        state, across, figures = self._decode(turned, plan, white, black)
+        state, across, figures = self._decode(turned, plan, white, black, saturation)
         t = state.tuning
         sigma_v = float(np.nanmedian(across.sigma_px)) / t.scale
         v_map = np.empty((stack.shape[2], stack.shape[1]), np.float32)
@@ -169,12 +173,12 @@ class Reconstructor:
         return add
 
     def _decode(
-        self, stack: NDArray[Any], plan: AxisPlan, white: int, black: int
+        self, stack: NDArray[Any], plan: AxisPlan, white: int, black: int, saturation: int
     ) -> tuple[AxisState, Lines, Figures]:
         layout = make_layout(plan, white, black)
         ys = survey_rows(stack.shape[1])
         few = self._lines((ys.size, plan, "survey"))
-        state = survey(stack, ys, plan, layout, self.settings, few)
+        state = survey(stack, ys, plan, layout, self.settings, few, saturation)
         lines = self._lines((stack.shape[1], plan, "all"))
         rows = np.arange(stack.shape[1])
         arguments = (stack, layout, state.edge_filter, state.tuning, state.bars, lines)
@@ -254,14 +258,14 @@ def make_layout(plan: AxisPlan, white: int, black: int) -> Layout:
     )  # fmt: skip
 
 
-def first_tuning(plan: AxisPlan, settings: Settings, full_scale: int) -> Tuning:
-    """What is known before a look at the images."""
-    contrast_dn = settings.min_contrast_dn or 0.03 * full_scale
+def first_tuning(plan: AxisPlan, settings: Settings, saturation: int) -> Tuning:
+    """What is known before a look at the images; ``saturation`` is their full scale, DN."""
+    contrast_dn = settings.min_contrast_dn or 0.03 * saturation
     return Tuning(
         direction=1, reach_px=int(np.ceil(REACH_SD * FIRST_BLUR_PX)),
         around_px=4 * plan.division_px, scale=1.0, division_px=plan.division_px,
-        size_px=plan.size_px, floor_dn=0.002 * full_scale, lit_dn=0.5 * contrast_dn,
-        contrast_dn=contrast_dn, saturation=settings.saturation_dn or full_scale,
+        size_px=plan.size_px, floor_dn=0.002 * saturation, lit_dn=0.5 * contrast_dn,
+        contrast_dn=contrast_dn, saturation=saturation,
         least_width=0.0, most_width=np.inf, min_light=settings.min_light,
         noise_dn2=0.0, noise_dn=0.0, jump_px=settings.max_jump_px,
     )  # fmt: skip
@@ -269,10 +273,10 @@ def first_tuning(plan: AxisPlan, settings: Settings, full_scale: int) -> Tuning:
 
 def survey(
     stack: NDArray[Any], ys: NDArray[np.int64], plan: AxisPlan, layout: Layout,
-    settings: Settings, few: Lines,
+    settings: Settings, few: Lines, saturation: int | None = None,
 ) -> AxisState:  # fmt: skip
     """Measure direction, scale, noise and blur on a few rows, and choose the filters."""
-    tuning = first_tuning(plan, settings, int(np.iinfo(stack.dtype).max))
+    tuning = first_tuning(plan, settings, saturation or saturation_of(stack, settings))
     scratch = row_scratch(stack.shape[2], stack.dtype, -(-plan.size_px // plan.division_px))
     growth, _ = code_growth(stack, ys, layout, tuning, scratch.pixels)
     if not abs(growth) > 0:

@@ -7,7 +7,6 @@ executor's thread only hands over.
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections import deque
@@ -24,7 +23,6 @@ from sensor_msgs.msg import PointCloud2
 from sl_interfaces.action import Scan
 from sl_interfaces.msg import MatchedFrame, PatternStack, RigCalibration, ScanReport
 from sl_interfaces.srv import Scan as ScanService
-from std_msgs.msg import String
 
 from sl_projector.base_node import (
     CAMERA_FRAME,
@@ -77,7 +75,7 @@ _SETTINGS = {
     "estimator": "matched, or cubic: the paper's third-order fit with secant and centres by BR8",
     "edge_blur_px": "standard deviation of an edge's blur, camera px; 0: measured in each stack",
     "min_contrast_dn": "least difference of lit and unlit at an edge; 0: 3 % of the full scale",
-    "saturation_dn": "values from here on are saturated; 0: the type's full scale",
+    "saturation_dn": "values from here on are saturated; 0: the full scale that the values show",
     "max_jump_px": "an edge lies at most so far from where its neighbours lead, camera px",
     "min_slope": "least slope of an edge over the one that the blur makes expect",
     "max_slope": "greatest slope of an edge over the one that the blur makes expect",
@@ -106,7 +104,7 @@ class ReconstructNode(RigNode):
         self._clouds = self.create_publisher(PointCloud2, "reconstruct/points", LARGE)
         self._reports = self.create_publisher(ScanReport, "reconstruct/report", EVENTS)
         self._rigs = self.create_publisher(RigCalibration, "calibration/rig", LATCHED)
-        self._publish_settings()
+        self.latch_settings("reconstruct/settings")(self._workshop.settings.to_dict())
         self._frames = (
             self.create_publisher(TFMessage, "/tf_static", LATCHED) if TFMessage else None
         )
@@ -158,12 +156,6 @@ class ReconstructNode(RigNode):
             given = self.declare(item.name, zero if item.default is None else item.default, text)
             values[item.name] = None if item.default is None and not given else given
         return Settings(**values)
-
-    def _publish_settings(self) -> None:
-        """Latch the settings as JSON: a recording then holds what its clouds were made with."""
-        self._settings = self.create_publisher(String, "reconstruct/settings", LATCHED)
-        text = json.dumps(self._workshop.settings.to_dict(), sort_keys=True)
-        self._settings.publish(String(data=text))
 
     def health(self) -> Health:
         """Whether a scan could be made."""

@@ -27,8 +27,8 @@ class Settings:
     min_contrast_dn : float, optional
         Least difference between lit and unlit at an edge. None is 3 % of the full scale.
     saturation_dn : int, optional
-        Values from here on are saturated. None is the full scale of the stack's type (255 or
-        65535); say 4095 for 12-bit data in 16-bit images.
+        Values from here on are saturated. None is the full scale of the stack: 255 for 8 bits;
+        for 16-bit images that of the fewest bits (10, 12, 14, 16) that hold every value.
     max_jump_px : float
         An edge is refused when it lies further than this from where its neighbours on either
         side lead: at a depth step the blur mixes two surfaces. Camera pixels.
