@@ -240,6 +240,8 @@ class Bench:
         self.stage.open_switches()
         self.stage.jam(False)
         self.stage.fall_silent(False)
+        self.stage.lose_replies(0)
+        self.stage.delay_replies(0, 0.0)
         self.stage.lose_steps(0.0)
         self.stage.remove_switches()
 

@@ -45,7 +45,9 @@ class ReadyNode(Node):  # type: ignore[misc]  # rclpy carries no types
             values = {item.key: item.value for item in status.values}
             if "calibration" in values:
                 self._calibrations[name] = values["calibration"]
-            # A rig that has yet to be calibrated is ready for just that.
+            # A rig that has yet to be calibrated is ready for just that; a refusal passes.
+            if values.get("passing") and level == DiagnosticStatus.WARN:
+                level = DiagnosticStatus.OK
             if values.get("compiled") == "True" and level == DiagnosticStatus.WARN:
                 level = DiagnosticStatus.OK
             self._said[name] = (level, status.message)

@@ -182,22 +182,21 @@ class CameraNode(RigNode):
         """Publish frames as they come. This thread alone reads and configures the camera."""
         while not self._stop.is_set():
             self._obey()
-            if not self._link.connected:
+            if (driver := self._link.current) is None:
                 self._stop.wait(READ_TIMEOUT_S)
                 continue
-            driver = self._link.device()
             try:
                 frame = driver.read(READ_TIMEOUT_S)
+                if frame is not None and not self._stop.is_set():
+                    self._publish(frame)
             except Exception as error:  # whatever went wrong, a fresh connection is the answer
                 self._link.lost(driver, error)
-                continue
-            if frame is not None and not self._stop.is_set():
-                self._publish(frame)
 
     def _publish(self, frame: Frame) -> None:
         """Publish whole frames; half a frame would become wrong points."""
         if frame.status is not FrameStatus.OK:
             self.get_logger().warning(f"frame {frame.frame_id} came incomplete, thrown away")
+            self.note(f"frame {frame.frame_id} came incomplete, thrown away")
             return
         if self._settings.trigger == "software":
             try:
@@ -264,8 +263,8 @@ class CameraNode(RigNode):
         except Empty:
             return
         fault: SlError | None = None
-        if self._link.connected:
-            fault = self._configure(self._link.device(), settings)
+        if (driver := self._link.current) is not None:
+            fault = self._configure(driver, settings)
         if fault is None:
             self._tell(settings, self._full_scale_dn)
             order.set_result(None)

@@ -296,6 +296,7 @@ def _verify(talk: GrblConversation, target_mm: Triple) -> None:
     """The controller must stand where it was sent, to a step and the report's rounding."""
     for i, (found, wanted) in enumerate(zip(talk.machine_mm or target_mm, target_mm, strict=True)):
         if abs(found - wanted) > 0.002 + 1.0 / talk.settings.get(100 + i, 1000.0):
+            talk.distrust()  # its planner counts from elsewhere than its position
             raise DeviceError(
                 f"the stage says that it has moved but stands at MPos {talk.machine_mm} mm, "
                 f"expected {tuple(round(value, 4) for value in target_mm)}"

@@ -356,6 +356,10 @@ class GrblConversation:
                 raise DeviceTimeout(f"no status from {self.port} within {self.reply_timeout_s:g} s")
             return self._report
 
+    def distrust(self) -> None:
+        """Begin the next line with a reset: what the controller says does not fit together."""
+        self._resync = True
+
     def expire_report(self) -> None:
         """The report at hand is from before a command: the next caller gets a new one."""
         self._report_time = -math.inf

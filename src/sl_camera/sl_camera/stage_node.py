@@ -148,13 +148,14 @@ class StageNode(RigNode):
     def _poll(self) -> None:
         """Read and publish the pose; a stage that is gone is noticed here."""
         while not self._stop.wait(self._period_s):
-            if not self._link.connected:
+            if (driver := self._link.current) is None:
                 continue
-            driver = self._link.device()
             try:
                 self._publish_pose(driver)
             except DeviceError as error:
                 self._check_lost(driver, error)
+            except Exception as error:  # nobody else watches the stage
+                self._link.lost(driver, error)
 
     def _publish_pose(self, driver: StageDriver) -> None:
         """No pose in an alarm, while homing or without a device: then it is not known."""
@@ -172,7 +173,7 @@ class StageNode(RigNode):
         return stage_pose(position_m, stamp_ns, WORLD_FRAME)
 
     def _check_lost(self, driver: StageDriver, error: DeviceError) -> None:
-        self.last_error = str(error)
+        self.note(str(error))
         if isinstance(error, DeviceLost) or driver.state().kind == "lost":
             self._link.lost(driver, error)
 
@@ -190,6 +191,7 @@ class StageNode(RigNode):
             except SlError as error:
                 response.success, response.message = False, str(error)
                 self.get_logger().error(f"{name} failed: {error}")
+                self.note(f"{name} failed: {error}")
                 self._notice(error)
             except Exception as error:  # the caller gets an answer whatever happens
                 response.success, response.message = False, f"internal fault: {error!r}"
@@ -200,10 +202,11 @@ class StageNode(RigNode):
 
     def _notice(self, error: SlError) -> None:
         """A service that lost the device leaves it to be opened anew."""
-        if isinstance(error, (DeviceLost, DeviceTimeout)) and self._link.connected:
-            driver = self._link.device()
-            if driver.state().kind == "lost":
-                self._link.lost(driver, error)
+        driver = self._link.current
+        if driver is None or not isinstance(error, (DeviceLost, DeviceTimeout)):
+            return
+        if driver.state().kind == "lost":
+            self._link.lost(driver, error)
 
     def _move(self, driver: StageDriver, request: Any, response: Any) -> None:
         target_m = (request.target.x, request.target.y, request.target.z)

@@ -7,6 +7,7 @@ what is wrong with one becomes a count, a log line and a reply.
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections import Counter
@@ -50,6 +51,11 @@ IMAGES = _qos(64)
 LARGE = _qos(4)
 #: What a late subscriber needs as well.
 LATCHED = _qos(1, latched=True)
+
+
+#: A refusal is a warning on `/diagnostics` for so long: at least two messages.
+NOTED_S = 2.5
+DIAGNOSTICS_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -112,12 +118,13 @@ class RigNode(Node):  # type: ignore[misc]  # rclpy carries no types
         super().__init__(name, namespace=NAMESPACE, **options)
         self.counts: Counter[str] = Counter()
         self.last_error = ""
+        self._noted_s = -math.inf
         self.workers = ThreadPoolExecutor(4, thread_name_prefix=name)
         self.long_work = ReentrantCallbackGroup()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         #: Timers run on it, so that a bag's clock that stands still does not stop them.
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0, self._publish_diagnostics, clock=self.steady)
+        self.create_timer(DIAGNOSTICS_S, self._publish_diagnostics, clock=self.steady)
 
     def health(self) -> Health:
         """Say how the node is; called once a second in the executor's thread."""
@@ -186,10 +193,14 @@ class RigNode(Node):  # type: ignore[misc]  # rclpy carries no types
         if self.context.ok():
             self.get_logger().info(text)
 
+    def note(self, text: str) -> None:
+        """Remember what was refused or failed; for a moment it makes a healthy node warn."""
+        self.last_error, self._noted_s = text, time.monotonic()
+
     def complain(self, topic: str, error: Exception) -> None:
         """Count and log something that was refused."""
         self.counts[f"{topic} refused"] += 1
-        self.last_error = f"{topic}: {error}"
+        self.note(f"{topic}: {error}")
         self.get_logger().warning(self.last_error, throttle_duration_sec=0.2)
 
     def _count_lost(self, topic: str, lost: int) -> None:
@@ -217,12 +228,16 @@ class RigNode(Node):  # type: ignore[misc]  # rclpy carries no types
     def _publish_diagnostics(self) -> None:
         health = self.health()
         values = {**health.values, **self.counts}
+        level, message = health.level, health.message
         if self.last_error:
             values["last refusal"] = self.last_error
+        if level == "ok" and time.monotonic() - self._noted_s < NOTED_S:
+            # The node itself is well: whoever waits for it need not wait for this to pass.
+            level, message, values["passing"] = "warn", self.last_error, True
         status = DiagnosticStatus(
-            level=_LEVELS[health.level],
+            level=_LEVELS[level],
             name=f"{self.get_name()}: {health.component}",
-            message=health.message,
+            message=message,
             hardware_id=health.hardware_id,
             values=[KeyValue(key=str(k), value=str(v)) for k, v in values.items()],
         )

@@ -60,6 +60,11 @@ class DeviceLink(Generic[DeviceT]):
         """Whether the device is open."""
         return self._device is not None
 
+    @property
+    def current(self) -> DeviceT | None:
+        """The open device, or None: for threads that go on without one."""
+        return self._device
+
     def device(self) -> DeviceT:
         """Return the open device.
 

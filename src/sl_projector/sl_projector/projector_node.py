@@ -171,14 +171,15 @@ class ProjectorNode(RigNode):
     def _poll(self) -> None:
         """Ask the device once a second how it is; a device that is gone is noticed here."""
         while not self._stop.wait(1.0):
-            if not self._link.connected:
+            if (driver := self._link.current) is None:
                 continue
-            driver = self._link.device()
             try:
                 self._status = driver.status()
                 self._spare_mirrors(driver)
             except SlError as error:
                 self._check_lost(driver, error)
+            except Exception as error:  # nobody else watches the device
+                self._link.lost(driver, error)
 
     def _spare_mirrors(self, driver: ProjectorDriver) -> None:
         if time.monotonic() - self._last_run < self._idle_after_s:
@@ -192,7 +193,7 @@ class ProjectorNode(RigNode):
 
     def _check_lost(self, driver: ProjectorDriver, error: SlError) -> None:
         """Open the device anew when it is gone or silent; other errors concern the request only."""
-        self.last_error = str(error)
+        self.note(str(error))
         if isinstance(error, (DeviceLost, DeviceTimeout)):
             self._link.lost(driver, error)
 
