@@ -74,7 +74,7 @@ def test_noise_is_independent_between_frames_and_neighbours():
     sensor = (1.0, 3.0, 65535.0)
     a, b = (read(1000.0, sensor, key(frame=f)) - 1000.0 for f in (7, 8))
     pairs = [(a, b), (a[:, :-1], a[:, 1:]), (a[:-1], a[1:])]
-    pairs += [(x**2, y**2) for x, y in pairs]  # the two of a Box-Muller pair share a radius
+    pairs += [(x**2, y**2) for x, y in pairs]  # the two of a pair share a hash
     for x, y in pairs:
         correlation = np.corrcoef(x.ravel(), y.ravel())[0, 1]
         assert abs(correlation) < 4 / np.sqrt(x.size)

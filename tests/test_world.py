@@ -228,7 +228,8 @@ def test_defocus_widens_edges():
 
 
 def test_any_mirror_image_takes_the_general_path_to_the_same_light(flat):
-    for pattern in (FINE, FINE_ROWS):
+    # Of each pair of inverses one is rendered, and the other taken from white.
+    for pattern in (FINE, FINE.inverse(), FINE_ROWS, FINE_ROWS.inverse()):
         mirrors = pattern.frame(DMD)
         expected = flat.electrons_per_second(mirrors)
         u, v = np.rint(flat.projector_px(flat.truth_points(np.array([[350.0, 40.0]])))[0]).astype(
@@ -335,7 +336,7 @@ def test_cached_frames_are_few_and_read_only():
     assert len(precise().patterns) < CACHED_FRAMES
     mirrors = np.zeros((768, 1024), dtype=bool)
     for k in range(CACHED_FRAMES + 3):
-        mirrors[:, k] = True
+        mirrors[:, k + 1] = True  # the first stays off: its inverse would be made from white
         world.electrons_per_second(mirrors)
     assert world.electrons_per_second(WHITE) is not frame
 

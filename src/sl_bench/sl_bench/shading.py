@@ -194,14 +194,26 @@ def _slope(before: float, here: float, after: float) -> Any:
     return a if abs(a) < abs(b) else b
 
 
-@inlined
-def gradient2(m: Any, j: int, i: int) -> Any:
-    """Squared gradient of a sample map, per camera pixel squared."""
-    up, down = max(j - 1, 0), min(j + 1, m.shape[0] - 1)
-    left, right = max(i - 1, 0), min(i + 1, m.shape[1] - 1)
-    gx = 2.0 * _slope(m[j, left], m[j, i], m[j, right]) if left < i < right else 0.0
-    gy = 2.0 * _slope(m[up, i], m[j, i], m[down, i]) if up < j < down else 0.0
-    return min(gx * gx + gy * gy, MAX_GRADIENT * MAX_GRADIENT)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _carry(m: Any, j: int, spread: Any, extra: Any, out: Any) -> None:
+    """Variance on the DMD along one of its axes, px^2, of a row of samples.
+
+    The squared gradient of the map, per camera pixel squared, carries the lens's extra blur to
+    the DMD; at the border of the map there is none.
+    """
+    top, steep = np.float32(MAX_BLUR_PX**2), np.float32(MAX_GRADIENT**2)
+    here, last = m[j], m.shape[1] - 1
+    inner = 0 < j < m.shape[0] - 1
+    above, below = (m[j - 1], m[j + 1]) if inner else (here, here)
+    for i in range(1, last):
+        gx = _slope(here[i - 1], here[i], here[i + 1])
+        gy = _slope(above[i], here[i], below[i])
+        steepness = min(np.float32(4.0) * (gx * gx + gy * gy), steep)
+        out[i] = min(spread[i] + extra[i] * extra[i] * steepness, top)
+    for i in (0, last):
+        gy = _slope(above[i], here[i], below[i])
+        steepness = min(np.float32(4.0) * gy * gy, steep)
+        out[i] = min(spread[i] + extra[i] * extra[i] * steepness, top)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -210,12 +222,12 @@ def blur_rows(maps: Any, rows: Any) -> None:
 
     The lens's blur beyond that in focus is carried to the DMD by the local gradient of u (v).
     """
-    top = MAX_BLUR_PX * MAX_BLUR_PX
+    spread = np.empty(maps[0].shape[1], dtype=np.float32)
+    extra = np.empty_like(spread)
     for j in range(rows[0], rows[1]):
-        for i in range(maps[0].shape[1]):
-            spread, extra2 = maps[4][j, i], maps[5][j, i] * maps[5][j, i]
-            maps[4][j, i] = min(spread + extra2 * gradient2(maps[0], j, i), top)
-            maps[5][j, i] = min(spread + extra2 * gradient2(maps[1], j, i), top)
+        spread[:], extra[:] = maps[4][j], maps[5][j]
+        _carry(maps[0], j, spread, extra, maps[4][j])
+        _carry(maps[1], j, spread, extra, maps[5][j])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

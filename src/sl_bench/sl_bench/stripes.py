@@ -14,6 +14,8 @@ PHASES = 32
 #: Blur levels are closer than this fraction of the smallest variance, up to MAX_LEVELS of them.
 LEVEL_STEP = 0.08
 MAX_LEVELS = 48
+#: So many samples of a row are asked together whether the lit DMD's border is far.
+CHUNK = 64
 #: A Gaussian is cut off at this many standard deviations.
 REACH = 4.5
 
@@ -58,10 +60,13 @@ def blur_levels(lowest: float, highest: float) -> Levels:
 
 @njit(cache=True, nogil=True)
 def blurred_line(profile: Any, levels: Any) -> Any:
-    """Blurred 1-D pattern ((size + 2 reach) PHASES + 1, levels), from u = -reach - 0.5 on."""
+    """Blurred 1-D pattern ((size + 2 reach) PHASES + 1, levels), from u = -reach - 0.5 on.
+
+    Its ends are dark, so that all beyond may be looked up there.
+    """
     reach, size = levels.reach, profile.size
     out = np.zeros(((size + 2 * reach) * PHASES + 1, levels.levels), dtype=np.float32)
-    for entry in range(out.shape[0]):
+    for entry in range(1, out.shape[0] - 1):
         base, phase = entry // PHASES - reach, entry % PHASES
         for m in range(max(base - reach, 0), min(base + reach + 1, size)):
             if profile[m]:
@@ -71,24 +76,44 @@ def blurred_line(profile: Any, levels: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _level(levels: Any, variance: Any) -> Any:
-    """Level below a variance, and the share of the one above."""
-    q = (variance - np.float32(levels.first)) * np.float32(levels.per_step)
-    k = min(max(int(q), 0), levels.levels - 2)
+def _level(scale: Any, variance: Any) -> Any:
+    """Level below a variance, and the share of the one above; scale: first, per step, levels."""
+    q = (variance - scale[0]) * scale[1]
+    k = np.int32(min(max(np.int32(q), np.int32(0)), np.int32(scale[2] - 2)))
     return k, q - np.float32(k)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _on_line(line: Any, levels: Any, x: Any, variance: Any) -> Any:
-    """Brightness of a blurred line at coordinate x, px."""
-    at = (x + np.float32(levels.reach + 0.5)) * np.float32(PHASES)
-    if not np.float32(0.0) <= at < np.float32(line.shape[0] - 1):
-        return np.float32(0.0)
-    i = int(at)
-    f = at - np.float32(i)
-    k, g = _level(levels, variance)
-    low = line[i, k] + f * (line[i + 1, k] - line[i, k])
-    high = line[i, k + 1] + f * (line[i + 1, k + 1] - line[i, k + 1])
+def _scale(levels: Any) -> Any:
+    """Numbers of `Levels` alone: an array handed on with them is counted at every sample."""
+    offset = np.float32(levels.reach + 0.5)
+    return np.float32(levels.first), np.float32(levels.per_step), np.int32(levels.levels), offset
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _place(scale: Any, entries: Any, x: Any, variance: Any) -> Any:
+    """Where a coordinate, px, falls in a blurred line: flat index, shares of next entry, level."""
+    at = (x + scale[3]) * np.float32(PHASES)
+    at = min(max(at, np.float32(0.0)), np.float32(entries - 1))
+    entry = np.int32(min(np.int32(at), np.int32(entries - 2)))
+    k, g = _level(scale, variance)
+    return np.int32(entry * scale[2] + k), at - np.float32(entry), g
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _places(scale: Any, entries: Any, x: Any, variance: Any, places: Any) -> None:
+    """`_place` of a row; apart from the look-up, so that it is made of vector instructions."""
+    place, f, g = places
+    for i in range(x.size):
+        place[i], f[i], g[i] = _place(scale, entries, x[i], variance[i])
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _between(line: Any, place: Any, levels: int, f: Any, g: Any) -> Any:
+    """Brightness at a place of a blurred line, given flat."""
+    here, there = line[place], line[place + 1]
+    low = here + f * (line[place + levels] - here)
+    high = there + f * (line[place + levels + 1] - there)
     return low + g * (high - low)
 
 
@@ -98,7 +123,7 @@ def _tap_weights(levels: Any, fraction: Any, variance: Any, out: Any) -> None:
     at = fraction * PHASES
     i = min(int(at), PHASES - 1)
     f = np.float32(at - i)
-    k, g = _level(levels, variance)
+    k, g = _level(_scale(levels), variance)
     w = levels.weights
     for tap in range(2 * levels.reach + 1):
         low = w[i, tap, k] + f * (w[i + 1, tap, k] - w[i, tap, k])
@@ -161,21 +186,38 @@ def _down(lines: Any, weights: Any, first: int, scale: Any, out: Any) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _line_samples(
-    maps: Any, j: int, lines: Any, levels: Any, safe: Any, even: Any, odd: Any
+def _line_samples(light: Any, line: Any, levels: int, places: Any, even: Any, odd: Any) -> None:
+    """Light of one row of samples under a 1-D pattern."""
+    place, f, g = places
+    for i in range(even.size):
+        a, b = 2 * i, 2 * i + 1
+        even[i] = light[a] * _between(line, place[a], levels, f[a], g[a])
+        odd[i] = light[b] * _between(line, place[b], levels, f[b], g[b])
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _all_between(x: Any, low: Any, high: Any) -> bool:
+    inside = np.int32(0)
+    for i in range(x.size):
+        inside += np.int32((x[i] > low) & (x[i] < high))
+    return bool(inside == x.size)
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _border(
+    across: Any, variance: Any, line: Any, scale: Any, safe: Any, even: Any, odd: Any
 ) -> None:
-    """Light of one row of samples under a 1-D pattern; maps are (along, across, ...)."""
-    for i in range(maps[0].shape[1]):
-        value = maps[2][j, i]
-        if value > np.float32(0.0):
-            across = maps[1][j, i]
-            value *= _on_line(lines[0], levels[0], maps[0][j, i], maps[3][j, i])
-            if not safe[0] < across < safe[1]:
-                value *= _on_line(lines[1], levels[1], across, maps[4][j, i])
-        if i & 1:
-            odd[i >> 1] = value
-        else:
-            even[i >> 1] = value
+    """Darken the samples near and beyond the lit DMD's border."""
+    flat, low, high = line.ravel(), np.float32(safe[0]), np.float32(safe[1])
+    for first in range(0, across.size, CHUNK):
+        end = min(first + CHUNK, across.size)
+        if _all_between(across[first:end], low, high):
+            continue
+        for i in range(first, end):
+            half = odd if i & 1 else even
+            if half[i >> 1] > np.float32(0.0):
+                place, f, g = _place(scale, line.shape[0], across[i], variance[i])
+                half[i >> 1] *= _between(flat, place, scale[2], f, g)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -206,9 +248,19 @@ def render_lines(
     taps, width = weights.shape[1], out.shape[1]
     even = np.empty(width + taps - 1, dtype=np.float32)
     odd = np.empty_like(even)
+    places = (
+        np.empty(2 * even.size, dtype=np.int32),
+        np.empty(2 * even.size, dtype=np.float32),
+        np.empty(2 * even.size, dtype=np.float32),
+    )
+    along, across, light, spread, spread_across = maps
+    flat, scales = lines[0].ravel(), (_scale(levels[0]), _scale(levels[1]))
     samples = np.empty((2 * (rows[1] - rows[0] + taps - 1), width), dtype=np.float32)
     for k in range(samples.shape[0]):
-        _line_samples(maps, 2 * rows[0] + k, lines, levels, safe, even, odd)
+        j = 2 * rows[0] + k
+        _places(scales[0], lines[0].shape[0], along[j], spread[j], places)
+        _line_samples(light[j], flat, scales[0][2], places, even, odd)
+        _border(across[j], spread_across[j], lines[1], scales[1], safe, even, odd)
         _across(even, odd, weights, samples[k])
     for y in range(rows[0], rows[1]):
         _down(samples, weights, 2 * (y - rows[0]), scale, out[y])

@@ -102,7 +102,7 @@ class World:
         self.rig = rig
         self.optics = optics or Optics()
         self._scene_lock = threading.Lock()
-        self._render_lock = threading.Lock()
+        self._render_lock = threading.RLock()
         self._frames: OrderedDict[tuple[object, ...], Image] = OrderedDict()
         self._geometry: tuple[object, Geometry] | None = None
         self._maps: tuple[Image, ...] | None = None
@@ -166,9 +166,17 @@ class World:
         columns, rows = self.rig.projector.image_size
         if mirrors.shape != (rows, columns):
             raise ConfigError(f"mirrors.shape={mirrors.shape}; expected {(rows, columns)}")
-        on = np.ascontiguousarray(mirrors) != 0
-        shown = hashlib.blake2b(on.tobytes(), digest_size=16).digest()
-        return self._kept(scene, shown, lambda: self._render(self._traced(scene), on))
+        return self._shown(scene, np.ascontiguousarray(mirrors) != 0)
+
+    def _shown(self, scene: Scene, on: NDArray[np.bool_]) -> Image:
+        """Light of a mirror image; of each pair of inverses only one is rendered."""
+
+        def make() -> Image:
+            if on[0, 0] and not on.all():
+                return _difference(self._shown(scene, np.ones_like(on)), self._shown(scene, ~on))
+            return self._render(self._traced(scene), on)
+
+        return self._kept(scene, _digest(on), make)
 
     def ambient_e_per_s(self) -> Image:
         """Noise-free electrons per second of the ambient light, (H, W), read-only."""
@@ -209,20 +217,24 @@ class World:
             uint8, or uint16 for 10 and 12 bits.
         """
         scene = self._scene
-        electrons: Image = self._ambient(scene) * np.float32(exposure_s)
-        for mirrors, seconds in parts:
-            electrons += self._projected(scene, mirrors) * np.float32(seconds)
-        return self._digitised(electrons, frame_number)
+        lights = [(self._ambient(scene), exposure_s)]
+        lights += [(self._projected(scene, mirrors), seconds) for mirrors, seconds in parts]
+        return self._digitised(lights, frame_number)
 
     def _digitised(
-        self, electrons: Image, frame_number: int
+        self, lights: list[tuple[Image, float]], frame_number: int
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        optics = self.optics
+        optics, electrons = self.optics, np.empty_like(lights[0][0])
         dtype = np.uint8 if optics.bits == 8 else np.uint16
         out: NDArray[np.uint8] | NDArray[np.uint16] = np.empty(electrons.shape, dtype=dtype)
         sensor = (optics.dn_per_e, optics.read_noise_e, float(optics.max_dn))
         key = np.uint64(photons.frame_key(np.uint64(optics.seed), np.uint64(frame_number)))
-        in_strips(lambda r: photons.digitise(electrons, r, sensor, key, out), out.shape[0])
+
+        def work(rows: tuple[int, int]) -> None:
+            _integrate(lights, electrons[slice(*rows)], slice(*rows))
+            photons.digitise(electrons, rows, sensor, key, out)
+
+        in_strips(work, out.shape[0])
         return out
 
     def _traced(self, scene: Scene) -> Geometry:
@@ -363,6 +375,30 @@ class World:
 
 def _finish(finish: Finish | str) -> Finish:
     return make_finish(finish) if isinstance(finish, str) else finish
+
+
+def _difference(white: Image, part: Image) -> Image:
+    """Light of the mirrors that are off in a part of the white image."""
+    out = np.empty_like(white)
+
+    def work(rows: tuple[int, int]) -> None:
+        strip = slice(*rows)
+        np.subtract(white[strip], part[strip], out=out[strip])
+        np.maximum(out[strip], np.float32(0.0), out=out[strip])
+
+    in_strips(work, out.shape[0])
+    return out
+
+
+def _integrate(lights: list[tuple[Image, float]], electrons: Image, strip: slice) -> None:
+    """Electrons of some rows: the sum of each light over its seconds."""
+    electrons[...] = 0.0
+    for light, seconds in lights:
+        electrons += light[strip] * np.float32(seconds)
+
+
+def _digest(on: NDArray[np.bool_]) -> bytes:
+    return hashlib.blake2b(np.packbits(on).data, digest_size=16).digest()
 
 
 def _pixels(q_px: Array) -> Array:
