@@ -88,19 +88,20 @@ class Bench:
         self.dmd.on_exposure = self.camera.on_exposure
         self._timers: list[threading.Timer] = []
         self._world_lock = threading.Lock()
+        self._parts = 0
         self._ended = threading.Event()
         self._preparer = threading.Thread(target=self._prepare_loop, name="preparer", daemon=True)
 
     def start(self) -> None:
-        """Open all endpoints; the first frame is rendered before, so that no scan waits for it."""
-        self._render(Exposure(0, [(self.dmd.mirrors_now(), 0.01)], 0.01, self.stage.position_m()))
-        self._preparer.start()
+        """Open all endpoints, then render a first frame, so that no scan waits for the compiler."""
         self._usb_server = UsbSocketServer(str(self._dir / "usb.sock"), self.usb)
         self.stage.start()
         self.stage.link(self._dir / "stage")
         self.camera.start()
         self._control = ControlServer(self._dir / "control.sock", self.execute)
         self._control.start()
+        self._render(Exposure(0, [(self.dmd.mirrors_now(), 0.01)], 0.01, self.stage.position_m()))
+        self._preparer.start()
 
     def close(self) -> None:
         """Close and remove all endpoints."""
@@ -146,15 +147,15 @@ class Bench:
             return self.world.expose(shown, exposure.exposure_s, exposure.number)
 
     def _prepare_loop(self) -> None:
-        """Trace the rays as soon as the stage rests in a new place.
+        """Trace the rays as soon as the stage rests in a new place, or with a new part.
 
-        That takes a second or so; the first frame of a scan right after a move would wait for it.
+        The first frame of a scan right after that would wait for it, half a second or so.
         """
-        before = ready = self.stage.position_m()
+        before = ready = (self._parts, self.stage.position_m())
         while not self._ended.wait(REST_S):
-            now = self.stage.position_m()
+            now = (self._parts, self.stage.position_m())
             if now == before != ready:
-                self._prepare(now)
+                self._prepare(now[1])
                 ready = now
             before = now
 
@@ -183,7 +184,7 @@ class Bench:
         surface = make_surface(part["surface"], **part.get("parameters", {}))
         with self._world_lock:
             self.world.put(surface, part.get("finish"))
-        self._prepare(self.stage.position_m())
+            self._parts += 1
         return {}
 
     def _set_lamp(self, brightness: float) -> dict[str, Any]:

@@ -174,8 +174,8 @@ class Graph:
 
     def _write_config(self) -> Path:
         config = write_config(self._options.source, self._options.directory, self._options.changes)
-        if self._options.bench:
-            # Imported late: hardware does without it.
+        if self._options.bench and not self._options.changes.uncalibrated:
+            # Imported late: hardware does without it, and every process waits for this.
             from sl_bench.bench_settings import read_settings
             from sl_bench.true_rig import write_rig
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from sl_bringup import pictures
 from sl_projector.documents import written_atomically
 from sl_projector.errors import StackError
 from sl_reconstruct.cloud import Cloud
@@ -112,6 +111,8 @@ def _draw(
     cloud: Cloud, height: HeightMap | None, plane: Plane | None, title: str
 ) -> dict[str, tuple[str, bytes]]:
     """Pictures by file name, each with its caption."""
+    from sl_bringup import pictures  # imported late: half a second that clouds alone do without
+
     drawn = {}
     if height is not None:
         drawn["picture_height"] = "Height map", pictures.height_picture(height, title)

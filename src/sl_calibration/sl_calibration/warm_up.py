@@ -6,17 +6,14 @@ shared, so the node starts this module as a process of its own.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
 
-import numpy as np
+from sl_projector import kernel_cache
 
-from sl_calibration.detect import find_plate
-from sl_calibration.plate import Plate
-from sl_projector.sequence import named
-from sl_reconstruct.correspondence import correspondences
-
+_MARK = "calibration"
 _DMD, _CAMERA = (64, 48), (96, 64)
 _HOLES, _STEP_PX, _RADIUS_PX = 6, 32, 8
 #: The nodes' own work comes first.
@@ -25,6 +22,14 @@ _NICENESS = 10
 
 def warm_up() -> None:
     """Find a drawn plate, and decode a stack without anything in it."""
+    # Imported late: where all is compiled the process ends without a second of imports.
+    import numpy as np
+
+    from sl_calibration.detect import find_plate
+    from sl_calibration.plate import Plate
+    from sl_projector.sequence import named
+    from sl_reconstruct.correspondence import correspondences
+
     side = _HOLES * _STEP_PX
     v, u = np.mgrid[:side, :side]
     off = np.hypot(u % _STEP_PX - _STEP_PX / 2, v % _STEP_PX - _STEP_PX / 2)
@@ -32,6 +37,8 @@ def warm_up() -> None:
     find_plate(image, Plate(_HOLES, _HOLES), 255.0)
     sequence = named("precise-rows", _DMD)
     correspondences(np.zeros((len(sequence), *_CAMERA[::-1]), np.uint8), sequence)
+    with contextlib.suppress(OSError):
+        kernel_cache.mark(_MARK).touch()
 
 
 def warm_up_apart() -> subprocess.Popen[bytes]:
@@ -45,6 +52,6 @@ def warm_up_apart() -> subprocess.Popen[bytes]:
     )
 
 
-if __name__ == "__main__":
+if __name__ == "__main__" and not kernel_cache.mark(_MARK).exists():
     os.nice(_NICENESS)
     warm_up()

@@ -195,7 +195,7 @@ class ReconstructNode(RigNode):
                 self._compiler.wait()
             if self.context.ok():
                 warm_up()
-                self._compiler = compile_apart(rest=True)
+                self._compiler = None if compiled(rest=True) else compile_apart(rest=True)
         except Exception as error:  # the first real stack will say it again
             self.get_logger().error(f"warm-up failed: {error!r}")
         self._ready = True

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections import OrderedDict
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +25,6 @@ from sl_reconstruct.settings import Settings
 
 #: Sequences whose reconstructor, with its scratch memory, is kept.
 MAX_SEQUENCES = 1
-_MARK = "reconstruct"
 _TINY_CAMERA, _TINY_DMD = (64, 16), (32, 24)
 
 
@@ -113,12 +113,16 @@ def warm_up(rest: bool = False) -> None:
         stack = np.zeros((len(sequence), *_TINY_CAMERA[::-1]), dtype)
         Reconstructor(tiny_rig(), sequence)(stack)
     with contextlib.suppress(OSError):
-        kernel_cache.mark(_MARK).touch()
+        _mark(rest).touch()
 
 
-def compiled() -> bool:
+def compiled(rest: bool = False) -> bool:
     """Tell whether `warm_up` ran before on the sources as they are."""
-    return kernel_cache.mark(_MARK).exists()
+    return _mark(rest).exists()
+
+
+def _mark(rest: bool) -> Path:
+    return kernel_cache.mark("reconstruct_rest" if rest else "reconstruct")
 
 
 def compile_apart(rest: bool = False) -> subprocess.Popen[bytes]:
