@@ -29,6 +29,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from sl_bench.bench_control import BenchControl
@@ -50,6 +51,8 @@ ANSWER_S = 180.0
 OUTLIER_PART, SIGMAS, SLACK_M = 1e-4, 6.0, 2e-6
 #: ... or when it lacks more than this part of the clean cloud's points.
 MISSING_PART = 0.02
+#: So far from where it stood for the clean clouds the stage may stand, after what it suffered.
+REPEATABILITY_M = 10e-6
 #: Scans after which everything that is made once has been made.
 WARM_SCANS = 20
 
@@ -189,10 +192,11 @@ class Client:
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
         from sensor_msgs.msg import PointCloud2
+        from sl_interfaces.msg import PatternTrigger
         from sl_interfaces.srv import MoveStage, Scan
         from std_srvs.srv import Trigger
 
-        from sl_projector.base_node import LARGE
+        from sl_projector.base_node import EVENTS, LARGE
 
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self._node = rclpy.create_node("soak", namespace="sl")
@@ -203,6 +207,10 @@ class Client:
         }
         self.clouds: list[Any] = []
         self.health: dict[str, tuple[float, int, str]] = {}
+        self.exposing = threading.Event()
+        self._node.create_subscription(
+            PatternTrigger, "projector/trigger", lambda _: self.exposing.set(), EVENTS
+        )
         self._node.create_subscription(PointCloud2, "reconstruct/points", self._on_cloud, LARGE)
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_health, 50)
         self._executor = SingleThreadedExecutor()
@@ -251,14 +259,12 @@ class Client:
         return found
 
 
-def wrong(cloud: Any, clean: Any) -> str:
-    """What is wrong with a cloud; empty when nothing is."""
-    import numpy as np
-
+def wrong(cloud: Any, clean: Any, offset_m: float) -> str:
+    """What is wrong with a cloud of a part that stands a little elsewhere; empty: nothing."""
     here, there = np.isfinite(cloud["z"]), np.isfinite(clean["z"])
     both = here & there
     variance = cloud["sigma"].astype(float) ** 2 + clean["sigma"].astype(float) ** 2
-    limit_m = SIGMAS * np.sqrt(variance[both]) + SLACK_M
+    limit_m = SIGMAS * np.sqrt(variance[both]) + SLACK_M + 2.0 * offset_m
     far = int((np.abs(cloud["z"][both] - clean["z"][both]) > limit_m).sum())
     if far > OUTLIER_PART * both.sum():
         return f"{far} of {both.sum()} points are elsewhere"
@@ -273,8 +279,11 @@ def wrong(cloud: Any, clean: Any) -> str:
 class Soak:
     """Runs plans against a graph and keeps the books."""
 
-    def __init__(self, client: Client, control: BenchControl, directory: Path) -> None:
+    def __init__(
+        self, client: Client, control: BenchControl, directory: Path, keep: Path | None
+    ) -> None:
         self._client, self._control, self._directory = client, control, directory
+        self._keep = keep
         self._clean: dict[str, Any] = {}
         self.frames: dict[str, int] = {}
         self.pids = processes_of(directory)
@@ -282,10 +291,12 @@ class Soak:
         self.recoveries_s: dict[str, list[float]] = defaultdict(list)
         self.samples: dict[str, list[dict[str, int]]] = defaultdict(list)
         self.defects: list[str] = []
+        self.spent_s: Counter[str] = Counter()
         self.reasons: Counter[str] = Counter()
 
     def learn(self, sequences: list[str]) -> None:
         """Make the clean clouds."""
+        self._origin_m = self._stage_m()
         for sequence in sequences:
             answer = self._client.ask("scan", ANSWER_S, sequence=sequence, max_repeats=30)
             if answer is None or not answer.success:
@@ -294,6 +305,9 @@ class Soak:
             self._clean[sequence] = self._client.clouds.pop()
             self.frames[sequence] = len(named(sequence))
 
+    def _stage_m(self) -> list[float]:
+        return list(self._control.state()["stage_m"])
+
     def _await_clouds(self, count: int) -> None:
         end_s = time.monotonic() + 10.0
         while len(self._client.clouds) < count and time.monotonic() < end_s:
@@ -301,6 +315,9 @@ class Soak:
 
     def run(self, index: int, what: Plan) -> None:
         """Make one scan, see what came of it, heal."""
+        self._client.exposing.clear()
+        began_s = time.monotonic()
+        offset_m = max(abs(a - b) for a, b in zip(self._stage_m(), self._origin_m, strict=True))
         threads = [threading.Thread(target=self._sabotage, args=(what, time.monotonic()))]
         if what.move:
             threads.append(threading.Thread(target=self._move, args=(what,)))
@@ -309,13 +326,18 @@ class Soak:
         answer = self._client.ask(
             "scan", ANSWER_S, sequence=what.sequence, max_repeats=what.repeats
         )
+        answered_s = time.monotonic()
         for thread in threads:
             thread.join()
-        self._judge(index, what, answer)
-        began_s = time.monotonic()
+        self._judge(index, what, answer, offset_m)
+        healed_s = time.monotonic()
         self._heal(index, what)
-        self.recoveries_s[what.name].append(time.monotonic() - began_s)
+        well_s = time.monotonic()
+        self.recoveries_s[what.name].append(well_s - healed_s)
         self._sample(index)
+        self.spent_s["scan"] += answered_s - began_s
+        self.spent_s["recover"] += well_s - healed_s
+        self.spent_s["else"] += time.monotonic() - well_s + healed_s - answered_s
 
     def _sabotage(self, what: Plan, began_s: float) -> None:
         if not what.device:
@@ -329,10 +351,12 @@ class Soak:
             self._control.clear_faults()
 
     def _move(self, what: Plan) -> None:
-        time.sleep(max(0.0, what.after_s - 0.05))
-        self._client.move(0.5e-3)
+        """Move while patterns are shown; before them the part would rightly show elsewhere."""
+        if self._client.exposing.wait(10.0):
+            time.sleep(max(0.0, what.after_s - 0.05))
+            self._client.move(0.5e-3)
 
-    def _judge(self, index: int, what: Plan, answer: Any) -> None:
+    def _judge(self, index: int, what: Plan, answer: Any, offset_m: float) -> None:
         book = self.books[what.name]
         book["scans"] += 1
         if answer is None:
@@ -348,10 +372,16 @@ class Soak:
             self.reasons[_words(answer.message)] += 1
             if not answer.message:
                 self._defect(index, what, "refused without a reason")
+        # Carriages stop between two steps when power fails: they come back to within a few.
+        if offset_m > REPEATABILITY_M:
+            self._defect(index, what, f"the stage stood {offset_m * 1e6:.0f} um off")
         clouds, self._client.clouds[:] = list(self._client.clouds), []
         for cloud in clouds:
-            if fault := wrong(cloud, self._clean[what.sequence]):
-                self._defect(index, what, f"WRONG CLOUD: {fault}")
+            if fault := wrong(cloud, self._clean[what.sequence], offset_m):
+                self._defect(index, what, f"WRONG CLOUD: {fault} ({offset_m * 1e6:.1f} um off)")
+                if self._keep:
+                    file = self._keep / f"wrong_{index}.npz"
+                    np.savez(file, cloud=cloud, clean=self._clean[what.sequence])
 
     def _defect(self, index: int, what: Plan, text: str) -> None:
         self.books[what.name]["defects"] += 1
@@ -489,7 +519,7 @@ def soak(arguments: argparse.Namespace, options: GraphOptions) -> dict[str, Any]
     draw = random.Random(arguments.seed)
     began_s = time.monotonic()
     with BenchControl(options.directory) as control:
-        run = Soak(Client(), control, options.directory)
+        run = Soak(Client(), control, options.directory, arguments.keep)
         run.learn(arguments.sequences.split(","))
         for index in range(arguments.scans):
             what = plan(draw, run.frames)
@@ -499,7 +529,8 @@ def soak(arguments: argparse.Namespace, options: GraphOptions) -> dict[str, Any]
             if index % 25 == 24:
                 lasted_s = time.monotonic() - began_s
                 totals = dict(sum(run.books.values(), Counter()))
-                print(f"{index + 1} scans, {lasted_s:.0f} s: {totals}", flush=True)
+                spent = {name: round(seconds) for name, seconds in run.spent_s.items()}
+                print(f"{index + 1} scans, {lasted_s:.0f} s {spent}: {totals}", flush=True)
         return {**run.report(), "seed": arguments.seed, "lasted_s": time.monotonic() - began_s}
 
 
@@ -516,6 +547,7 @@ def main(make: Callable[..., dict[str, Any]] = soak) -> int:
     parser.add_argument("--attach", action="store_true", help="use the graph that runs")
     parser.add_argument("--log", type=Path, default=Path("soak_graph.log"))
     parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--keep", type=Path, help="folder for wrong clouds")
     parser.add_argument("--verbose", action="store_true", help="tell each plan")
     arguments = parser.parse_args()
     options = GraphOptions(bench=True, domain=arguments.domain)

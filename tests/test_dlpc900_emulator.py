@@ -355,3 +355,50 @@ def test_power_cycle_forgets(host):
     assert host.read(0x1A31) == bytes(6)
     host.write(0x1A1B, 3)
     assert host.write(0x1A24, 2) == 7
+
+
+# -- what host programs do differently ---------------------------------------------------------
+
+
+def test_reports_may_lack_padding_or_carry_the_report_id(host):
+    """HID libraries are handed the report id 0 in front; some programs write what they have."""
+    read_curtain = struct.pack("<BBHH", 0xC0, 7, 2, 0x1100)
+    wanted = host.device.receive(read_curtain.ljust(64, b"\0"))
+    assert wanted[0][:4] == bytes([0xC0, 7, 6, 0])
+    assert host.device.receive(read_curtain) == wanted
+    assert host.device.receive(b"\0" + read_curtain.ljust(64, b"\0")) == wanted
+    # Image data has no flags at all: the id in front of it is told by the length alone.
+    stream = image(WHITE)
+    assert host.write(0x1A2A, *struct.pack("<HI", 0, len(stream))) == 0
+    for at in range(0, len(stream), 504):
+        part = stream[at : at + 504]
+        packet = struct.pack("<BBHHH", 0, 1, len(part) + 4, 0x1A2B, len(part)) + part
+        for start in range(0, len(packet), 64):
+            assert host.device.receive(b"\0" + packet[start : start + 64].ljust(64, b"\0")) == []
+    assert host.read(0x0100) == b"\0"
+    assert host.define() == 0
+    assert host.write(0x1A31, 1, 0, 1, 0, 0, 0) == 0
+    assert host.device.pattern(0).all()
+
+
+def test_a_message_of_no_length_is_refused_in_a_reply(host):
+    (reply,) = host.device.receive(struct.pack("<BBH", 0xC0, 9, 0).ljust(64, b"\0"))
+    assert reply[:4] == bytes([0xE0, 9, 0, 0])
+    assert host.read(0x0100) == b"\x06"
+    assert host.read(0x1A1B) == b"\x03"
+
+
+@pytest.mark.parametrize("order", [(0, 2), (2,), (0, 0, 1, 2), (1, 2)])
+def test_start_and_stop_in_any_order(host, order):
+    assert host.upload(0, image(WHITE)) == 0
+    assert host.define() == 0
+    assert host.write(0x1A31, 1, 0, 1, 0, 0, 0) == 0
+    for value in order:
+        assert host.write(0x1A24, value) == 0
+    host.finish()
+    assert len(host.edges) == 1
+    for command, value in ((0x0201, 1), (0x0201, 0), (0x0201, 1), (0x0201, 3), (0x0200, 1)):
+        assert host.write(command, value) == 0
+        assert host.read(command) == bytes([value & 1 if value < 3 else 0])
+    assert host.write(0x0200, 0) == 0
+    assert host.write(0x1A24, 2) == 0

@@ -36,6 +36,7 @@ from sl_projector.dmd import DmdModel, dmd_model
 
 REPORT = 64
 BUFFER = 512
+NACK = 0x20  # flag of a reply
 
 # Registers that are only stored: command, bytes at power-up.
 _STORED = {
@@ -161,15 +162,21 @@ class Dlpc900Emulator:
             self._pending.clear()
 
     def receive(self, report: bytes) -> list[bytes]:
-        """Take one report from the host; return the reply's reports, mostly none or one."""
+        """Take one report from the host; return the reply's reports, mostly none or one.
+
+        A report may lack its padding, or have the report id in front (65 bytes), as it is handed
+        to HID libraries.
+        """
+        if len(report) == REPORT + 1 and report[0] == 0:
+            report = report[1:]
         with self._lock:
             self._pending += report.ljust(REPORT, b"\0")
-            (length,) = struct.unpack_from("<H", self._pending, 2)
+            flags, sequence, length = struct.unpack_from("<BBH", self._pending)
             needed = 4 + length
             if not 2 <= length <= BUFFER - 4:
                 self._pending.clear()
                 self._fail(INVALID_PARAMETER, f"message of {length} bytes")
-                return []
+                return self._reply(flags, sequence, b"", NACK)
             if len(self._pending) < needed:
                 return []
             message = bytes(self._pending[:needed])
@@ -184,11 +191,15 @@ class Dlpc900Emulator:
         try:
             data = self._execute(command, message[6:], read)
         except Refusal as refusal:
-            nack = 0x20
+            nack = NACK
             self._fail(refusal.code, f"0x{command:04X}: {refusal.reason}")
         else:
             if command not in (0x0100, 0x0101):
                 self._error, self._error_text = NO_ERROR, ""
+        return self._reply(flags, sequence, data, nack)
+
+    def _reply(self, flags: int, sequence: int, data: bytes, nack: int) -> list[bytes]:
+        """Reports of a reply; none when the host wants none."""
         if not flags & 0x40:
             return []
         reply = struct.pack("<BBH", flags & 0xC7 | nack, sequence, len(data)) + data

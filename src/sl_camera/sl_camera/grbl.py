@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections.abc import Iterator
 
-from sl_camera.grbl_conversation import GrblConversation, Triple
+from sl_camera.grbl_conversation import POLL_S, GrblConversation, Triple
 from sl_camera.grbl_protocol import (
     HOLD,
     JOG_CANCEL,
@@ -24,7 +25,7 @@ from sl_camera.stage import Position, StageLimits, StageState
 from sl_projector.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
 
 HOMING_POLL_S = 0.5  # an AVR answers no status while it homes, and need not be pestered
-NEEDED_SETTINGS = (110, 111, 112, 120, 121, 122, 130, 131, 132)
+NEEDED_SETTINGS = (130, 131, 132)
 
 
 class GrblStage:
@@ -80,8 +81,8 @@ class GrblStage:
             talk.exchange("$$", self._reply_timeout_s)
             missing = [n for n in NEEDED_SETTINGS if n not in talk.settings]
             if missing:
-                raise DeviceError(f"{self.port} has no settings {missing}, expected $110 to $132")
-            talk.report(fresh=True)
+                raise DeviceError(f"{self.port} has no settings {missing}, expected $130 to $132")
+            talk.know_position()
         except DeviceError:
             talk.close()
             raise
@@ -293,11 +294,23 @@ class GrblStage:
 
 
 def _verify(talk: GrblConversation, target_mm: Triple) -> None:
-    """The controller must stand where it was sent, to a step and the report's rounding."""
-    for i, (found, wanted) in enumerate(zip(talk.machine_mm or target_mm, target_mm, strict=True)):
-        if abs(found - wanted) > 0.002 + 1.0 / talk.settings.get(100 + i, 1000.0):
+    """The controller must stand where it was sent; there are some that are idle too early."""
+    while not _is_at(talk, target_mm):
+        before_mm = talk.machine_mm
+        time.sleep(POLL_S)
+        talk.report(fresh=True)
+        if talk.machine_mm == before_mm:
             talk.distrust()  # its planner counts from elsewhere than its position
             raise DeviceError(
                 f"the stage says that it has moved but stands at MPos {talk.machine_mm} mm, "
                 f"expected {tuple(round(value, 4) for value in target_mm)}"
             )
+
+
+def _is_at(talk: GrblConversation, target_mm: Triple) -> bool:
+    """To a step and the report's rounding."""
+    found = zip(talk.machine_mm or target_mm, target_mm, strict=True)
+    return all(
+        abs(value - wanted) <= 0.002 + 1.0 / (talk.settings.get(100 + i) or 1000.0)
+        for i, (value, wanted) in enumerate(found)
+    )

@@ -14,12 +14,14 @@ from collections.abc import Callable
 
 from sl_camera.grbl_protocol import (
     ALARMS_KEEPING_POSITION,
+    ECHO,
     RESET,
     STATUS,
     Report,
     alarm_code,
     alarm_text,
     error_text,
+    is_supported,
     parse_report,
     parse_setting,
 )
@@ -30,6 +32,7 @@ POLL_S = 0.1  # GRBL asks for at most 10 status requests a second
 NUDGE_S = 0.25
 STILL_S = 5.0  # without a time-out a wait ends after standing still for so long
 RESET_ATTEMPTS = 4
+REPORTS_TO_OFFSET = 31
 IDLE_WITHOUT_REPLY_S = 1.0  # idle for so long with the answer to a dwell owing: it is lost
 MAX_LINE = 79  # characters, of GRBL's 80 with the line end
 INCH_MM = 25.4
@@ -139,6 +142,7 @@ class GrblConversation:
             self._cv.notify_all()
 
     def _on_line(self, line: str) -> None:
+        line = line.lstrip(ECHO)
         with self._cv:
             if line == "ok" or line.startswith("error:"):
                 self._replies.append(line)
@@ -237,10 +241,23 @@ class GrblConversation:
         """
         if not self._banners:
             self.reset()
-        if not self.version.lower().startswith(("grbl 1.1", "grblhal 1.1")):
+        if not is_supported(self.version):
             raise DeviceError(f"{self.port} answers {self.version!r}, expected GRBL or grblHAL 1.1")
         self._banner_wanted = False
         self.alarm, self.is_deaf = None, False  # from before us; the state says what still holds
+
+    def know_position(self) -> None:
+        """Ask for the status until it tells a machine position.
+
+        A controller that reports work positions (``$10``) sends their offset in every 30th report
+        at the latest; one that never does has none.
+        """
+        for _ in range(REPORTS_TO_OFFSET):
+            self.report(fresh=True)
+            if self.machine_mm is not None:
+                return
+        self._offset_mm = (0.0, 0.0, 0.0)
+        self.report(fresh=True)
 
     def exchange(
         self,

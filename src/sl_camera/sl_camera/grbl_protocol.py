@@ -6,6 +6,7 @@ where they are marked so. Pure functions, no port.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from sl_camera.stage import AXES, Position, StageLimits
@@ -15,6 +16,10 @@ RESUME = b"~"
 STATUS = b"?"
 RESET = b"\x18"
 JOG_CANCEL = b"\x85"
+#: What a controller that echoes puts in front of its own lines: commands that end no line.
+ECHO = "?!~\x18"
+#: Oldest version whose status reports and real-time commands are these.
+OLDEST_VERSION = (1, 1)
 
 ERRORS = {
     1: "a word has no letter",
@@ -156,14 +161,20 @@ def _triple(text: str) -> tuple[float, float, float]:
 
 
 def parse_setting(line: str) -> tuple[int, float] | None:
-    """Read ``$n=value``; None for a line that is none, or has no number (grblHAL has texts)."""
+    """Read ``$n=value (comment)``; None for another line, or no number (grblHAL has texts)."""
     name, equals, value = line.partition("=")
     if not (equals and name.startswith("$") and name[1:].isdigit()):
         return None
     try:
-        return int(name[1:]), float(value)
+        return int(name[1:]), float(value.partition("(")[0])
     except ValueError:
         return None
+
+
+def is_supported(banner: str) -> bool:
+    """Whether a banner is GRBL's or a descendant's, of version 1.1 or later."""
+    found = re.match(r"grbl\w*\s+v?(\d+)\.(\d+)", banner.lower())
+    return found is not None and (int(found[1]), int(found[2])) >= OLDEST_VERSION
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,88 @@
+"""How long from the call of ``scan`` to the first exposure when the sequence is already loaded.
+
+Run as ``python benchmarks/bench_first_exposure.py --domain N`` beside a graph of that domain. The
+exposure's start is the stamp of the first ``projector/trigger``; both are on this machine's
+clock. The way through the projector's own service and through the action is timed beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import threading
+import time
+from typing import Any
+
+from sl_bringup.graph import GraphOptions
+
+SEQUENCE = "paper"
+
+
+class Caller:
+    """Calls and hears triggers."""
+
+    def __init__(self) -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from sl_interfaces.msg import PatternTrigger
+        from sl_interfaces.srv import Project, Scan
+
+        from sl_projector.base_node import EVENTS
+
+        rclpy.init()
+        self._node = rclpy.create_node("first_exposure", namespace="sl")
+        self._scan = self._node.create_client(Scan, "scan")
+        self._project = self._node.create_client(Project, "projector/project")
+        self._first_ns: list[int] = []
+        self._node.create_subscription(PatternTrigger, "projector/trigger", self._hear, EVENTS)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        threading.Thread(target=self._executor.spin, daemon=True).start()
+        assert self._scan.wait_for_service(30) and self._project.wait_for_service(30)
+
+    def _hear(self, message: Any) -> None:
+        if message.index == 0:
+            stamp = message.header.stamp
+            self._first_ns.append(stamp.sec * 10**9 + stamp.nanosec)
+
+    def latency_ms(self, client: Any, **fields: Any) -> float:
+        """Call once; from the call to the first exposure, milliseconds."""
+        self._first_ns.clear()
+        done = threading.Event()
+        request = client.srv_type.Request(sequence=SEQUENCE, **fields)
+        called_ns = time.time_ns()
+        future = client.call_async(request)
+        future.add_done_callback(lambda _: done.set())
+        assert done.wait(120), "no answer"
+        assert self._first_ns, future.result().message
+        time.sleep(0.3)
+        return (self._first_ns[0] - called_ns) * 1e-6
+
+    def measure(self, repeats: int) -> None:
+        """Print medians."""
+        ways = {
+            "scan": lambda: self.latency_ms(self._scan, max_repeats=0),
+            "projector/project": lambda: self.latency_ms(self._project),
+        }
+        for way in ways.values():
+            way()  # loads the sequence
+        for name, way in ways.items():
+            times = sorted(way() for _ in range(repeats))
+            print(
+                f"{name}: median {statistics.median(times):.1f} ms, "
+                f"least {times[0]:.1f} ms, most {times[-1]:.1f} ms of {repeats} calls"
+            )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--domain", type=int, default=0)
+    parser.add_argument("--repeats", type=int, default=30)
+    arguments = parser.parse_args()
+    os.environ.update(GraphOptions(bench=True, domain=arguments.domain).transport.environment())
+    Caller().measure(arguments.repeats)
+
+
+if __name__ == "__main__":
+    main()
