@@ -26,6 +26,7 @@ from sl_bringup.bags import (
     open_bag,
     typestore,
 )
+from sl_bringup.cli import main
 from sl_bringup.record import size_bytes
 from sl_projector.errors import BagError, ConfigError
 from sl_projector.sequence import named
@@ -153,6 +154,73 @@ def test_cut_anywhere_all_whole_images_are_read(tmp_path: Path) -> None:
         index_bytes = 9 + 2 + 4 + 16
         assert numbers == [i for i, end in enumerate(ends) if end - index_bytes <= cut]
         assert [line for line in lost if f"of {cut} bytes" in line]
+
+
+def test_metadata_are_there_before_the_end(tmp_path: Path) -> None:
+    """What a killed recorder leaves names its files and topics, and is read without a complaint."""
+    size = SHAPE[0] * SHAPE[1]
+    with BagRecorder(tmp_path / "a", split_bytes=4 * size) as bag:
+        for topic in (SETTINGS, IMAGE):
+            bag.add_topic(f"/sl/{topic.name}", topic.msgtype, topic_qos(topic))
+        bag.tick()
+        for i in range(5):
+            stamp_ns = START_NS + (i + 1) * STEP_NS
+            bag.write("/sl/camera/image_raw", stamp_ns, stamp_ns, image_cdr(i))
+        text = (tmp_path / "a" / "metadata.yaml").read_text()
+        found = yaml.safe_load(text)["rosbag2_bagfile_information"]
+        assert found["relative_file_paths"] == ["a_0.mcap", "a_1.mcap"]
+        assert {t["topic_metadata"]["name"] for t in found["topics_with_message_count"]} == {
+            "/sl/reconstruct/settings", "/sl/camera/image_raw"
+        }  # fmt: skip
+        numbers, lost = images_in(tmp_path / "a")
+        assert numbers == list(range(5))
+        assert all("the end is missing" in line for line in lost)
+
+
+def test_a_file_that_the_metadata_do_not_name_is_read_all_the_same(tmp_path: Path) -> None:
+    """A recorder that is killed between a split and its metadata."""
+    record(tmp_path / "a", split_bytes=4 * SHAPE[0] * SHAPE[1])
+    metadata = tmp_path / "a" / "metadata.yaml"
+    content = yaml.safe_load(metadata.read_text())
+    content["rosbag2_bagfile_information"]["relative_file_paths"].pop()
+    metadata.write_text(yaml.safe_dump(content))
+    numbers, lost = images_in(tmp_path / "a")
+    assert numbers == list(range(COUNT))
+    assert any("a_2.mcap" in line for line in lost)
+
+
+@pytest.mark.parametrize("cut", [0.37, 0.99])
+def test_a_repaired_recording_is_whole_for_foreign_readers(tmp_path: Path, cut: float) -> None:
+    record(tmp_path / "a")
+    file = tmp_path / "a" / "a_0.mcap"
+    file.write_bytes(file.read_bytes()[: int(cut * file.stat().st_size)])
+    numbers, lost = images_in(tmp_path / "a")
+    assert lost
+    assert main(["repair", str(tmp_path / "a"), "--output", str(tmp_path / "b")]) == 0
+    assert images_in(tmp_path / "b") == (numbers, [])
+    with AnyReader([tmp_path / "b"]) as reader:
+        assert reader.message_count == len(numbers) + 1
+    with (tmp_path / "b" / "b_0.mcap").open("rb") as opened:
+        assert make_reader(opened, validate_crcs=True).get_summary() is not None
+    assert main(["repair", str(tmp_path / "a"), "--output", str(tmp_path / "b")]) == 1  # taken
+
+
+def test_nothing_can_be_repaired_of_nothing(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"x" * 100)
+    assert main(["repair", str(tmp_path / "a.mcap"), "--output", str(tmp_path / "b")]) == 1
+    assert not (tmp_path / "b").exists()
+
+
+def test_a_damaged_summary_is_noticed(tmp_path: Path) -> None:
+    """Any bit of it: its checksum is wrong then, and the file is followed record by record."""
+    ends = record(tmp_path / "a")
+    file = tmp_path / "a" / "a_0.mcap"
+    content = file.read_bytes()
+    for place in np.random.default_rng(1).integers(ends[-1] + 13, len(content) - 8, size=25):
+        hurt = bytearray(content)
+        hurt[place] ^= 1 << int(place) % 8
+        file.write_bytes(hurt)
+        assert images_in(file)[0] == list(range(COUNT))
 
 
 def test_a_damaged_image_is_left_out_and_told(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rosbags.highlevel import AnyReader
 
 from ros_graph import graph as ros_graph
 from ros_graph import require_ros, wait
@@ -91,9 +92,11 @@ def test_a_killed_recorder_leaves_all_but_the_last_second(
     live: tuple[Path, list], tmp_path: Path
 ) -> None:
     folder, hashes = live
-    assert not (folder / "killed" / "metadata.yaml").exists()
     assert evaluated(folder / "killed", tmp_path / "out") == hashes
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["lost"]
+    assert main(["repair", str(folder / "killed"), "--output", str(tmp_path / "mended")]) == 0
+    with AnyReader([tmp_path / "mended"]) as reader:
+        assert {c.topic for c in reader.connections} == {f"/sl/{t.name}" for t in RECORDED_TOPICS}
 
 
 def test_a_replay_gives_the_live_bits(live: tuple[Path, list]) -> None:

@@ -1,12 +1,14 @@
 """A recording as it grows: a rosbag2 directory of one or several mcap files.
 
-The messages come as they were on the wire. ``metadata.yaml`` is written at the end; until then,
-and for ever when the recorder is killed, the directory is read file by file.
+The messages come as they were on the wire. ``metadata.yaml`` is there from the first second on and
+kept up to date, so that what a killed recorder leaves has a list of its files and topics; only the
+counts in it, and the summary at the end of its last file, are then missing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -20,6 +22,10 @@ from sl_bringup.bags import typestore
 from sl_bringup.mcap_writer import McapWriter
 from sl_projector.documents import write_text
 from sl_projector.errors import BagError
+
+#: So often the metadata are written anew.
+METADATA_S = 5.0
+METADATA = "metadata.yaml"
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,7 @@ class BagRecorder:
         self._files: list[dict[str, Any]] = []
         self.counts: dict[str, int] = {}
         self._closed_bytes = 0
+        self._told_s = float("-inf")
         try:
             path.mkdir(parents=True)
         except FileExistsError:
@@ -137,11 +144,13 @@ class BagRecorder:
     def tick(self) -> None:
         """Hand over what has waited too long; call it several times a second."""
         self._writer.tick()
+        if time.monotonic() - self._told_s >= METADATA_S:
+            self._write_metadata([*self._files, _entry(self._writer)])
 
     def close(self) -> None:
         """End the file and write the metadata."""
         self._end_file()
-        write_text(self.path / "metadata.yaml", self._metadata())
+        self._write_metadata(self._files)
 
     def _put(self, name: str, log_ns: int, publish_ns: int, data: bytes) -> None:
         if name not in self._channels:
@@ -166,14 +175,7 @@ class BagRecorder:
         writer = self._writer
         writer.close()
         self._closed_bytes += writer.path.stat().st_size
-        self._files.append(
-            {
-                "path": writer.path.name,
-                "starting_time": {"nanoseconds_since_epoch": writer.start_ns},
-                "duration": {"nanoseconds": writer.end_ns - writer.start_ns},
-                "message_count": writer.message_count,
-            }
-        )
+        self._files.append(_entry(writer))
 
     def _split(self, log_ns: int) -> None:
         """Begin another file; what is latched is repeated, so that each file can be used alone."""
@@ -183,9 +185,14 @@ class BagRecorder:
         for name, (_, publish_ns, data) in self._latched.items():
             self._put(name, log_ns, publish_ns, data)
             self.counts[name] += 1
+        self._write_metadata([*self._files, _entry(self._writer)])
 
-    def _metadata(self) -> str:
-        used = [f for f in self._files if f["message_count"]]
+    def _write_metadata(self, files: Sequence[Mapping[str, Any]]) -> None:
+        self._told_s = time.monotonic()
+        write_text(self.path / METADATA, self._metadata(files))
+
+    def _metadata(self, files: Sequence[Mapping[str, Any]]) -> str:
+        used = [f for f in files if f["message_count"]]
         starts = [f["starting_time"]["nanoseconds_since_epoch"] for f in used] or [0]
         ends = [f["starting_time"]["nanoseconds_since_epoch"] + f["duration"]["nanoseconds"]
                 for f in used] or [0]  # fmt: skip
@@ -194,12 +201,12 @@ class BagRecorder:
             "storage_identifier": "mcap",
             "duration": {"nanoseconds": max(ends) - min(starts)},
             "starting_time": {"nanoseconds_since_epoch": min(starts)},
-            "message_count": sum(f["message_count"] for f in self._files),
+            "message_count": sum(f["message_count"] for f in files),
             "topics_with_message_count": [self._topic_metadata(t) for t in self._topics.values()],
             "compression_format": "",
             "compression_mode": "",
-            "relative_file_paths": [f["path"] for f in self._files],
-            "files": self._files,
+            "relative_file_paths": [f["path"] for f in files],
+            "files": list(files),
             "custom_data": self._custom or None,
             "ros_distro": "jazzy",
         }
@@ -216,3 +223,13 @@ class BagRecorder:
             },
             "message_count": self.counts[topic.name],
         }
+
+
+def _entry(writer: McapWriter) -> dict[str, Any]:
+    """What the metadata say of a file."""
+    return {
+        "path": writer.path.name,
+        "starting_time": {"nanoseconds_since_epoch": writer.start_ns},
+        "duration": {"nanoseconds": writer.end_ns - writer.start_ns},
+        "message_count": writer.message_count,
+    }

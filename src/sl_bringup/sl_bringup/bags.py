@@ -61,11 +61,13 @@ CAMERA_SETTINGS = Topic("camera/settings", "std_msgs/msg/String", latched=True)
 #: What the live graph made of it: verdicts of the matching, results, settings.
 FRAME = Topic("synchronizer/frame", "sl_interfaces/msg/MatchedFrame")
 REPORT = Topic("reconstruct/report", "sl_interfaces/msg/ScanReport")
+#: JSON: what it takes to solve a calibration again.
+CALIBRATION_RUN = Topic("calibration/run", "std_msgs/msg/String")
 SETTINGS = Topic("reconstruct/settings", "std_msgs/msg/String", latched=True)
 MATCHING = Topic("synchronizer/settings", "std_msgs/msg/String", latched=True)
 #: What comes from the devices, and what `slrig record` records.
 RAW_TOPICS = (TRIGGER, IMAGE, CAMERA_INFO, POSE, CALIBRATION, PROJECTOR_INFO, CAMERA_SETTINGS)
-RECORDED_TOPICS = (*RAW_TOPICS, FRAME, REPORT, SETTINGS, MATCHING)
+RECORDED_TOPICS = (*RAW_TOPICS, FRAME, REPORT, SETTINGS, MATCHING, CALIBRATION_RUN)
 
 DEFAULT_NAMESPACE = "/sl"
 
@@ -204,13 +206,25 @@ class Bag:
         quick : bool
             Pick few messages out of many, without a look at checksums.
 
+        Notes
+        -----
+        A message that does not fit its definition is left out and told in ``lost``.
+
         Raises
         ------
         BagError
-            When a message does not fit its definition.
+            When a topic has another type, or another version of it.
         """
         for raw in self.raw(*topics or TOPICS, quick=quick):
-            yield Recorded(raw.topic, raw.received_ns, _decode(raw.data, raw.topic, self.path))
+            try:
+                message = typestore().deserialize_cdr(raw.data, raw.topic.msgtype)
+            except Exception as exc:
+                self.lose(
+                    f"a message of {len(raw.data)} bytes on {raw.topic.name} is no "
+                    f"{raw.topic.msgtype}: {_reason(exc)}"
+                )
+                continue
+            yield Recorded(raw.topic, raw.received_ns, message)
 
     def raw(self, *topics: Topic, quick: bool = False) -> Iterator[Raw]:
         """Yield the messages of the given topics as they were on the wire."""
@@ -219,6 +233,11 @@ class Bag:
             connections = [c for c in file.storage.connections if c.topic in wanted]
             if connections:
                 yield from self._read(file, connections, wanted, quick)
+
+    def everything(self) -> Iterator[tuple[Connection, int, bytes | memoryview]]:
+        """Yield every message of every topic: its connection, when it was recorded, CDR."""
+        for file in self._files:
+            yield from self._packets(file, file.storage.connections, quick=False)
 
     def has(self, topic: Topic) -> bool:
         """Whether the topic is in the bag."""
@@ -239,6 +258,13 @@ class Bag:
         for connection in connections:
             digest = connection.digest or file.digests.get(connection.topic, "")
             _check_type(connection, digest, wanted[connection.topic], self.path)
+        for connection, received_ns, data in self._packets(file, connections, quick):
+            yield Raw(wanted[connection.topic], received_ns, data)
+
+    def _packets(
+        self, file: _File, connections: Sequence[Connection], quick: bool
+    ) -> Iterator[tuple[Connection, int, bytes | memoryview]]:
+        """Messages of a file as far as it can be read."""
         storage = file.storage
         messages = (
             storage.messages(connections, check=not quick)
@@ -254,17 +280,7 @@ class Bag:
             except Exception as exc:  # a damaged file makes the reader fail in any way it can
                 self.lose(f"{file.name}: unreadable from here on ({_reason(exc)})")
                 return
-            yield Raw(wanted[connection.topic], received_ns, data)
-
-
-def _decode(data: bytes | memoryview, topic: Topic, path: Path) -> Any:
-    try:
-        return typestore().deserialize_cdr(data, topic.msgtype)
-    except Exception as exc:
-        raise BagError(
-            f"{path}: a message of {len(data)} bytes on {topic.name} is no {topic.msgtype}: "
-            f"{_reason(exc)}"
-        ) from None
+            yield connection, received_ns, data
 
 
 def _check_type(connection: Connection, digest: str, topic: Topic, path: Path) -> None:
@@ -313,9 +329,8 @@ def _open_files(bag: Bag, stack: ExitStack) -> None:
         bag._files += opened(bag, bag.path, stack)
     except Exception as exc:
         _refuse_formats(exc, bag.path)
-        no_metadata = isinstance(exc, FileNotFoundError)
-        why = "no metadata.yaml, read file by file" if no_metadata else _reason(exc)
-        (bag.notes.append if no_metadata else bag.lose)(f"{bag.path.name}: {why}")
+        harmless, why = _why_not_as_told(exc)
+        (bag.notes.append if harmless else bag.lose)(f"{bag.path.name}: {why}")
         for path in _storage_files(bag.path):
             bag._files += _open_damaged(bag, path, stack)
         if not bag._files:
@@ -324,6 +339,15 @@ def _open_files(bag: Bag, stack: ExitStack) -> None:
                 f"{bag.path} cannot be read: {told}; expected a rosbag2 directory or an .mcap or "
                 ".db3 file"
             ) from None
+
+
+def _why_not_as_told(exc: Exception) -> tuple[bool, str]:
+    """Whether it costs nothing that the metadata cannot be followed, and why they cannot."""
+    if isinstance(exc, FileNotFoundError):
+        return True, "no metadata.yaml, read file by file"
+    if isinstance(exc, ReaderError) and "magic" in str(exc):  # what is lost is told by the file
+        return True, "the recording was not ended, read file by file"
+    return False, _reason(exc)
 
 
 def _refuse_formats(exc: Exception, path: Path) -> None:
@@ -341,17 +365,23 @@ def _open_directory(bag: Bag, path: Path, stack: ExitStack) -> list[_File]:
     reader = DirectoryReader(path)
     reader.open()
     stack.callback(reader.close)
+    if unnamed := {p.name for p in _storage_files(path)} - _named_files(reader):
+        raise ReaderError(f"metadata.yaml does not name {', '.join(sorted(unnamed))}")
     held = sum(c.msgcount for storage in reader.storages for c in storage.connections)
-    if held != reader.metadata.message_count:
-        bag.lose(
-            f"{path.name}: the files hold {held} messages, {reader.metadata.message_count} were "
-            "recorded"
-        )
+    recorded = reader.metadata.message_count
+    if held != recorded:
+        tell = bag.lose if held < recorded else bag.notes.append
+        tell(f"{path.name}: the files hold {held} messages, {recorded} were recorded")
     unpack = zstd.decompress if reader.metadata.compression_mode == "message" else None
     digests = {c.topic: c.digest for c in reader.connections}
     return [
         _File(path.name, _fast(bag, storage, stack), digests, unpack) for storage in reader.storages
     ]
+
+
+def _named_files(reader: DirectoryReader) -> set[str]:
+    """Names of the files that the metadata name; compressed ones lie elsewhere meanwhile."""
+    return {Path(str(storage.path)).name for storage in reader.storages}
 
 
 def _fast(bag: Bag, storage: Any, stack: ExitStack) -> _Storage:

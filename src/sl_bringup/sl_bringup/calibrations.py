@@ -6,7 +6,7 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 
-from sl_bringup.bags import CALIBRATION, Bag
+from sl_bringup.bags import CALIBRATION, Bag, Recorded
 from sl_camera.matching import MatchedStack
 from sl_projector.errors import CalibrationError, SlError
 from sl_reconstruct.calibration_file import Calibration, load_calibration, parse_calibration
@@ -101,15 +101,27 @@ def _recorded_hashes(bag: Bag) -> list[InForce]:
 
 
 def _recorded_calibrations(bag: Bag) -> list[InForce]:
-    found = []
+    """Usable calibrations of the bag; unusable ones are told, and raised when there is no other."""
+    found, faults = [], []
     for recorded in bag.messages(CALIBRATION, quick=True):
-        message = recorded.message
-        calibration = parse_calibration(message.yaml, f"{bag.path}: {CALIBRATION.name}")
-        if message.hash and message.hash != calibration.hash:
-            raise CalibrationError(
-                f"{bag.path}: the calibration in the bag says hash {message.hash[:12]}... but has "
-                f"{calibration.hash[:12]}..."
-            )
-        source = f"{bag.path.name} (recorded from {message.source or 'an unnamed source'})"
-        found.append(InForce(calibration, source, recorded.received_ns))
+        try:
+            found.append(_recorded_calibration(bag, recorded))
+        except SlError as error:
+            faults.append(error)
+    if faults and not found:
+        raise faults[0]
+    for fault in faults:
+        bag.lose(str(fault))
     return sorted(found, key=lambda c: c.received_ns)
+
+
+def _recorded_calibration(bag: Bag, recorded: Recorded) -> InForce:
+    message = recorded.message
+    calibration = parse_calibration(message.yaml, f"{bag.path}: {CALIBRATION.name}")
+    if message.hash and message.hash != calibration.hash:
+        raise CalibrationError(
+            f"{bag.path}: the calibration in the bag says hash {message.hash[:12]}... but has "
+            f"{calibration.hash[:12]}..."
+        )
+    source = f"{bag.path.name} (recorded from {message.source or 'an unnamed source'})"
+    return InForce(calibration, source, recorded.received_ns)

@@ -26,6 +26,7 @@ COMMANDS: tuple[tuple[str, str, str], ...] = (
     ("import", "sl_bringup.importer", "make a recording of a folder of images"),
     ("record", "sl_bringup.record", "record what an evaluation needs"),
     ("replay", "sl_bringup.replay", "publish a recording as the devices did"),
+    ("repair", "sl_bringup.repair", "make a whole recording of what is readable"),
     ("evaluate", "sl_bringup.evaluate", "recordings to clouds, reports and pictures"),
     ("measure", "sl_bringup.measure", "measure a cloud: planes, angles, steps, roughness, ..."),
 )

@@ -51,6 +51,8 @@ from sl_bringup.mcap_records import (
 #: Messages outside of chunks are read together up to this size.
 RUN_BYTES = 1 << 21
 _TAIL_BYTES = HEAD.size + FOOTER_BODY.size + len(MAGIC)
+#: The summary's checksum and what follows it.
+_AFTER_CRC = 4 + len(MAGIC)
 _FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
     "ros2idl": MessageDefinitionFormat.IDL,
@@ -168,14 +170,17 @@ class McapFile:
             return False
         tail = self._bytes(self._size - _TAIL_BYTES, _TAIL_BYTES)
         opcode, length = HEAD.unpack_from(tail)
-        start = FOOTER_BODY.unpack_from(tail, HEAD.size)[0]
+        start, _, crc = FOOTER_BODY.unpack_from(tail, HEAD.size)
         ended = tail[-len(MAGIC) :] == MAGIC and (opcode, length) == (FOOTER, FOOTER_BODY.size)
         if not (ended and 0 < start < self._size):
             return False
         try:
+            whole = not crc or crc == zlib.crc32(
+                self._bytes(start, self._size - _AFTER_CRC - start)
+            )
             for opcode, place, length in self._records(start, self._size - _TAIL_BYTES):
                 self._take(opcode, self._bytes(place, length))
-            whole = self._summary_is_whole()
+            whole = whole and self._summary_is_whole()
         except (ReaderError, struct.error, ValueError):
             whole = False
         if not whole:
@@ -361,8 +366,8 @@ class McapFile:
         place = chunk.offset + HEAD.size
         head = self._bytes(place, min(256, chunk.length - HEAD.size))
         fields = Fields(head[CHUNK_HEAD.size :])
-        if fields.text():
-            return self._read(_without_index(chunk), wanted, check=False)
+        if fields.text():  # the whole chunk is unpacked anyway, so its checksum costs little
+            return self._read(_without_index(chunk), wanted, check=True)
         fields.unpack("Q")
         place += len(head) - fields.left
         found = []

@@ -183,7 +183,7 @@ class McapWriter:
         """Write the summary and close the file."""
         self._close_chunk()
         self._file.write(record(DATA_END, struct.pack("<I", 0)))
-        summary = self._file.tell()
+        summary, crc = self._file.tell(), 0
         offsets = b""
         for opcode, records in (
             (SCHEMA, self._schemas), (CHANNEL, self._channels), (STATISTICS, [self._statistics()]),
@@ -191,12 +191,14 @@ class McapWriter:
         ):  # fmt: skip
             start = self._file.tell()
             self._file.writelines(records)
+            crc = zlib.crc32(b"".join(records), crc)
             if records:
                 place = struct.pack("<BQQ", opcode, start, self._file.tell() - start)
                 offsets += record(SUMMARY_OFFSET, place)
         offsets_start = self._file.tell()
-        self._file.write(offsets)
-        self._file.write(record(FOOTER, FOOTER_BODY.pack(summary, offsets_start, 0)) + MAGIC)
+        footer = HEAD.pack(FOOTER, FOOTER_BODY.size) + struct.pack("<QQ", summary, offsets_start)
+        crc = zlib.crc32(footer, zlib.crc32(offsets, crc))
+        self._file.write(offsets + footer + struct.pack("<I", crc) + MAGIC)
         self._file.close()
 
     def _statistics(self) -> bytes:
