@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -149,6 +151,11 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
+def _import_meanwhile(module: str) -> None:
+    """Import what takes a second and is needed only when the cloud is there."""
+    threading.Thread(target=importlib.import_module, args=(module,), name=module).start()
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Scan once; exit status 0 only when the cloud is there."""
     args = _arguments(argv)
@@ -156,6 +163,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         client = ScanClient(args.namespace)
         client.connect(args.connect_timeout)
+        if not args.no_pictures:
+            _import_meanwhile("sl_bringup.pictures")
         goal = Scan.Goal(sequence=args.sequence, exposure_s=args.exposure, max_repeats=args.repeats)
         result, cloud = client.scan(goal, args.timeout)
         if sys.stderr.isatty():

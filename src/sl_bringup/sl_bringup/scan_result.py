@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -69,14 +70,22 @@ def write_result(
         Whether pictures and the page are made.
     """
     cloud = None if points is None else _cloud(points, report)
-    drawn = write_scan(folder, report, cloud, pictures)
-    if points is not None:
-        report["area_m"] = [float(np.nanmax(v) - np.nanmin(v)) for v in (points["x"], points["y"])]
-    if points is not None and measure == "groove":
-        report["groove"] = _groove(measure_groove(points))
+    with ThreadPoolExecutor(1) as beside:
+        found = beside.submit(_measured, points, measure)
+        drawn = write_scan(folder, report, cloud, pictures)
+    report.update(found.result())
     write_json(folder / "report.json", report)
     if pictures:
         write_page(folder / "report.html", report, drawn)
+
+
+def _measured(points: NDArray[Any] | None, measure: str) -> dict[str, Any]:
+    """Fields of the report that are measured on the cloud."""
+    if points is None:
+        return {}
+    extents = [float(np.nanmax(v) - np.nanmin(v)) for v in (points["x"], points["y"])]
+    groove = {"groove": _groove(measure_groove(points))} if measure == "groove" else {}
+    return {"area_m": extents, **groove}
 
 
 def check_cloud(points: NDArray[Any], report: Mapping[str, Any]) -> str:
