@@ -23,8 +23,9 @@ from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from sl_bringup.mcap_reader import McapFile
+from sl_bringup.mcap_reader import NO_TYPE, McapFile
 from sl_bringup.mcap_records import zstd
+from sl_bringup.sqlite_salvage import SalvagedFile
 from sl_projector.errors import BagError
 
 
@@ -256,6 +257,9 @@ class Bag:
         quick: bool,
     ) -> Iterator[Raw]:
         for connection in connections:
+            if connection.msgtype == NO_TYPE:
+                self.lose(f"{file.name}: what type {connection.topic} has cannot be read")
+                return
             digest = connection.digest or file.digests.get(connection.topic, "")
             _check_type(connection, digest, wanted[connection.topic], self.path)
         for connection, received_ns, data in self._packets(file, connections, quick):
@@ -429,9 +433,22 @@ def _open_damaged(bag: Bag, path: Path, stack: ExitStack) -> list[_File]:
         return _open_file(bag, path, stack)
     except Exception as exc:
         _refuse_formats(exc, path)
-        if path != bag.path:
-            bag.lose(f"{path.name}: {_reason(exc)}")
+        fault = exc
+    if path.suffix == ".db3":
+        try:
+            return [_salvaged(bag, path, stack)]
+        except ReaderError as exc:
+            fault = exc
+    if path != bag.path:
+        bag.lose(f"{path.name}: {_reason(fault)}")
     return []
+
+
+def _salvaged(bag: Bag, path: Path, stack: ExitStack) -> _File:
+    salvaged = SalvagedFile(path, bag.lose)
+    stack.callback(salvaged.close)
+    _check_cdr(salvaged.connections)
+    return _File(path.name, salvaged)
 
 
 def _namespace(bag: Bag, wanted: str | None) -> str:

@@ -23,6 +23,7 @@ from rosbags.interfaces import (
     ConnectionExtRosbag2,
     MessageDefinition,
     MessageDefinitionFormat,
+    Qos,
 )
 from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import parse_qos
@@ -48,6 +49,8 @@ from sl_bringup.mcap_records import (
     zstd,
 )
 
+#: Of a topic whose schema is not in the file.
+NO_TYPE = "__schemaless__"
 #: Messages outside of chunks are read together up to this size.
 RUN_BYTES = 1 << 21
 _TAIL_BYTES = HEAD.size + FOOTER_BODY.size + len(MAGIC)
@@ -174,13 +177,13 @@ class McapFile:
         ended = tail[-len(MAGIC) :] == MAGIC and (opcode, length) == (FOOTER, FOOTER_BODY.size)
         if not (ended and 0 < start < self._size):
             return False
+        if crc and crc != zlib.crc32(self._bytes(start, self._size - _AFTER_CRC - start)):
+            self._tell(f"{self.path.name}: the summary is damaged; read without it")
+            return False
         try:
-            whole = not crc or crc == zlib.crc32(
-                self._bytes(start, self._size - _AFTER_CRC - start)
-            )
             for opcode, place, length in self._records(start, self._size - _TAIL_BYTES):
                 self._take(opcode, self._bytes(place, length))
-            whole = whole and self._summary_is_whole()
+            whole = self._summary_is_whole()
         except (ReaderError, struct.error, ValueError):
             whole = False
         if not whole:
@@ -286,18 +289,16 @@ class McapFile:
             known.counts = dict(struct.iter_unpack("<HQ", fields.raw()))
 
     def _connection(self, number: int, schema: int, fields: Fields) -> Connection:
-        name, encoding, definition = self._known.schemas.get(schema, ("__schemaless__", "", ""))
+        name, encoding, definition = self._known.schemas.get(schema, (NO_TYPE, "", ""))
         topic, serialisation, metadata = fields.text(), fields.text(), fields.texts()
         return Connection(
             number,
             topic,
             name,
-            MessageDefinition(_FORMATS[encoding], definition),
+            MessageDefinition(_FORMATS.get(encoding, MessageDefinitionFormat.NONE), definition),
             metadata.get("topic_type_hash", ""),
             0,
-            ConnectionExtRosbag2(
-                serialisation, parse_qos(metadata.get("offered_qos_profiles", ""))
-            ),
+            ConnectionExtRosbag2(serialisation, offered_qos(metadata)),
             self,
         )
 
@@ -378,6 +379,14 @@ class McapFile:
                 data = memoryview(self._bytes(at, size))[MESSAGE_HEAD.size :]
                 found.append(Message(log_ns, (chunk.offset, offset), channel, data))
         return sorted(found)
+
+
+def offered_qos(metadata: Mapping[str, str]) -> list[Qos]:
+    """QoS that a topic was recorded with; none where it cannot be read: only players need it."""
+    try:
+        return parse_qos(metadata.get("offered_qos_profiles", ""))
+    except Exception:
+        return []
 
 
 _DECOMPRESSORS: dict[str, Callable[[bytes], bytes]] = {
