@@ -41,7 +41,7 @@ from sl_bringup.transport import process_environment
 from sl_projector.sequence import named
 
 NODES = ("projector", "camera", "stage", "synchronizer", "calibration", "reconstruct")
-READY_S = 300.0
+READY_S = 900.0
 #: So long all nodes may take to be well again; longest is a projector that does not answer at all.
 RECOVERY_S = 60.0
 #: A scan that is not answered for so long is counted as silent.
@@ -205,7 +205,7 @@ class Client:
         self._clients = {
             name: self._node.create_client(self._kinds.get(name, Trigger), name) for name in names
         }
-        self.clouds: list[Any] = []
+        self.clouds: list[tuple[int, Any]] = []  # with the start of their first exposure, ns
         self.health: dict[str, tuple[float, int, str]] = {}
         self.exposing = threading.Event()
         self._node.create_subscription(
@@ -220,7 +220,8 @@ class Client:
     def _on_cloud(self, message: Any) -> None:
         from sl_reconstruct.messages import cloud_from_msg
 
-        self.clouds.append(cloud_from_msg(message).copy())
+        stamp = message.header.stamp
+        self.clouds.append((stamp.sec * 10**9 + stamp.nanosec, cloud_from_msg(message).copy()))
 
     def _on_health(self, message: Any) -> None:
         for status in message.status:
@@ -292,6 +293,8 @@ class Soak:
         self.samples: dict[str, list[dict[str, int]]] = defaultdict(list)
         self.defects: list[str] = []
         self.spent_s: Counter[str] = Counter()
+        # Of a scan that is repeated because the projector failed at its end, two clouds may come.
+        self._sequences: list[tuple[int, str]] = []
         self.reasons: Counter[str] = Counter()
 
     def learn(self, sequences: list[str]) -> None:
@@ -302,7 +305,7 @@ class Soak:
             if answer is None or not answer.success:
                 raise SystemExit(f"no clean scan of {sequence}: {answer and answer.message}")
             self._await_clouds(1)
-            self._clean[sequence] = self._client.clouds.pop()
+            self._clean[sequence] = self._client.clouds.pop()[1]
             self.frames[sequence] = len(named(sequence))
 
     def _stage_m(self) -> list[float]:
@@ -317,6 +320,7 @@ class Soak:
         """Make one scan, see what came of it, heal."""
         self._client.exposing.clear()
         began_s = time.monotonic()
+        self._sequences.append((time.time_ns(), what.sequence))
         offset_m = max(abs(a - b) for a, b in zip(self._stage_m(), self._origin_m, strict=True))
         threads = [threading.Thread(target=self._sabotage, args=(what, time.monotonic()))]
         if what.move:
@@ -376,12 +380,13 @@ class Soak:
         if offset_m > REPEATABILITY_M:
             self._defect(index, what, f"the stage stood {offset_m * 1e6:.0f} um off")
         clouds, self._client.clouds[:] = list(self._client.clouds), []
-        for cloud in clouds:
-            if fault := wrong(cloud, self._clean[what.sequence], offset_m):
+        for stamp_ns, cloud in clouds:
+            sequence = next(s for began_ns, s in reversed(self._sequences) if began_ns <= stamp_ns)
+            if fault := wrong(cloud, self._clean[sequence], offset_m):
                 self._defect(index, what, f"WRONG CLOUD: {fault} ({offset_m * 1e6:.1f} um off)")
                 if self._keep:
                     file = self._keep / f"wrong_{index}.npz"
-                    np.savez(file, cloud=cloud, clean=self._clean[what.sequence])
+                    np.savez(file, cloud=cloud, clean=self._clean[sequence])
 
     def _defect(self, index: int, what: Plan, text: str) -> None:
         self.books[what.name]["defects"] += 1

@@ -27,6 +27,7 @@ from sl_projector.errors import (
 )
 from sl_projector.sequence import Pattern, PatternSequence, named
 from sl_projector.usb_socket import LinkBackend
+from stage_bench import until
 
 SIZE = dmd_model("DLP4500").size
 TIMING = Timing(2e-3, 500e-6)
@@ -107,8 +108,8 @@ def test_trigger_delays_out_of_range_are_refused(flash: list[Path]) -> None:
     bench = Bench(flash, trigger_out_1=TriggerOut(10e-6))
     with pytest.raises(ConfigError, match="delay"):
         bench.driver.open()
-    with pytest.raises(ConfigError, match="by time only"):
-        Dlpc350(settings=Dlpc350Settings(trigger_in=TriggerIn(300e-6)))
+    with pytest.raises(ConfigError, match="trigger input delay"):
+        Dlpc350(settings=Dlpc350Settings(trigger_in=TriggerIn(-1e-6)))
 
 
 # -- flash ----------------------------------------------------------------------------------------
@@ -204,7 +205,112 @@ def test_what_the_validation_finds_is_told(bench: Bench, monkeypatch: pytest.Mon
     assert bench.driver.load(sequence("precise")).uploaded
 
 
+# -- external trigger -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("trigger", "kinds"),
+    [
+        # TI's API: 0 internal, 1 rising, 2 falling edge, 3 follows without a trigger of its own
+        (TriggerIn(1e-3), [1, 1, 1, 1, 1, 1]),
+        (TriggerIn(1e-3, falling_edge=True), [2, 2, 2, 2, 2, 2]),
+        (TriggerIn(1e-3, first_only=True), [1, 3, 3, 1, 3, 3]),
+    ],
+)
+def test_patterns_wait_for_the_trigger_input(
+    flash: list[Path], trigger: TriggerIn, kinds: list[int]
+) -> None:
+    bench = Bench(flash, trigger_in=trigger)
+    bench.driver.open()
+    assert bench.sent(0x1A35) == [(9328).to_bytes(4, "little")]  # 1 ms in counts of 107.2 ns
+    some = PatternSequence("some", SIZE, sequence("precise").patterns[:3])
+    with pytest.raises(ConfigError, match="black before an external trigger"):
+        bench.driver.load(some, Timing(2e-3))
+    bench.driver.load(some, TIMING)
+    bench.driver.run(repeats=2)
+    words = [int.from_bytes(data[:4], "little") for data in bench.sent(0x1A3E)[-6:]]
+    assert [word & 3 for word in words] == kinds
+    assert all(word >> 17 & 1 for word in words)
+    for shown, kind in enumerate(kinds):
+        if kind in (1, 2):
+            until(lambda: bench.emulator.trigger_in(bench.clock.now_ns()), 60.0)
+        until(lambda wanted=shown + 1: len(bench.edges) >= wanted, 60.0)
+    bench.driver.wait(timeout_s=1e6)
+    assert [np.array_equal(e[0], some.frame(i % 3) > 0) for i, e in enumerate(bench.edges)] == (
+        [True] * 6
+    )
+    bench.driver.close()
+
+
 # -- faults ---------------------------------------------------------------------------------------
+
+
+def run_anew(bench: Bench) -> None:
+    """Open, load, show: the next scan is right."""
+    bench.driver.open()
+    bench.edges.clear()
+    bench.driver.load(sequence("precise"), TIMING)
+    bench.driver.run()
+    bench.driver.wait(timeout_s=1e6)
+    for i, (mirrors, index, _, _) in enumerate(bench.edges):
+        assert index == i
+        np.testing.assert_array_equal(mirrors, sequence("precise").frame(i) > 0)
+    assert len(bench.edges) == 25
+
+
+@pytest.mark.parametrize("fault", ["late_replies", "stale_replies", "short_replies", "stalls"])
+def test_a_single_fault_of_the_bus_is_not_noticed(bench: Bench, fault: str) -> None:
+    bench.emulator.faults.late_s = 0.3
+    setattr(bench.emulator.faults, fault, 1)
+    assert bench.driver.status().ok
+    run_anew(bench)
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"),
+    [("late_replies", DeviceTimeout), ("short_replies", DeviceTimeout), ("stalls", DeviceLost)],
+)
+def test_a_lasting_fault_of_the_bus_is_told(
+    bench: Bench, fault: str, error: type[DeviceError]
+) -> None:
+    bench.emulator.faults.late_s = 1e3
+    setattr(bench.emulator.faults, fault, 1000)
+    with pytest.raises(error):
+        bench.driver.status()
+    setattr(bench.emulator.faults, fault, 0)
+    run_anew(bench)
+
+
+def test_a_kernel_driver_is_detached_and_another_program_is_told(bench: Bench) -> None:
+    bench.driver.close()
+    bench.emulator.faults.kernel_driver = True
+    bench.driver.open()
+    bench.driver.close()
+    bench.emulator.faults.taken = True
+    with pytest.raises(DeviceLost, match="another program"):
+        bench.driver.open()
+    bench.emulator.faults.taken = False
+    run_anew(bench)
+
+
+def test_unplugged_in_a_run(bench: Bench) -> None:
+    bench.driver.load(sequence("precise"), TIMING)
+    bench.driver.run()
+    bench.bus.unplug()
+    with pytest.raises(DeviceLost):
+        bench.driver.wait()
+    bench.bus.plug_in()
+    run_anew(bench)
+
+
+def test_trigger_edges_are_lost_and_doubled_on_request(bench: Bench) -> None:
+    bench.driver.load(sequence("precise"), TIMING)
+    bench.emulator.faults.lost_edges = {1}
+    bench.emulator.faults.doubled_edges = {3}
+    bench.driver.run()
+    bench.driver.wait(timeout_s=1e6)
+    assert [index for _, index, _, _ in bench.edges] == [0, 2, 3, 3, *range(4, 25)]
+    run_anew(bench)
 
 
 def test_a_refused_command_is_named(bench: Bench) -> None:

@@ -212,6 +212,36 @@ def test_external_trigger_advances_one_pattern_an_edge():
     bench.driver.close()
 
 
+def test_external_trigger_of_the_first_pattern_only():
+    """TI: a trigger is attached to its pattern, so one entry of the table may have it alone."""
+    bench = Bench(clock=SystemClock(), trigger_in=TriggerIn(200e-6, first_only=True))
+    bench.driver.open()
+    sequence = named("paper")
+    bench.driver.load(sequence, FAST)
+    entries = [data for _, c, data in bench.recorder.messages() if c == 0x1A34]
+    assert [data[5] >> 7 for data in entries] == [1] + [0] * (len(sequence) - 1)
+    shown = threading.Semaphore(0)
+    bench.emulator.on_exposure = lambda *exposure: (bench.edges.append(exposure), shown.release())
+    bench.driver.run(repeats=2)
+    edges_ns = []
+    for _ in range(2):
+        edge_ns = bench.clock.now_ns()
+        while not bench.emulator.trigger_in(edge_ns):
+            edge_ns = bench.clock.now_ns()
+        edges_ns.append(edge_ns)
+        for _ in sequence.patterns:  # one edge shows them all
+            assert shown.acquire(timeout=60)
+    bench.driver.wait(timeout_s=60)
+    count = len(sequence)
+    starts = [
+        edge + 200_000 + i * FAST.exposure_us * 1000 for edge in edges_ns for i in range(count)
+    ]
+    assert [start_ns for _, _, start_ns, _ in bench.edges] == starts
+    for mirrors, index, _, _ in bench.edges:
+        np.testing.assert_array_equal(mirrors, sequence.frame(index % count) == 255)
+    bench.driver.close()
+
+
 def test_untriggered_wait_for_an_external_trigger_times_out():
     bench = Bench(clock=SystemClock(), trigger_in=TriggerIn())
     bench.driver.open()

@@ -310,6 +310,37 @@ def test_zaber_power_cycle_costs_the_reference(
     assert emulator.position_m()[0] == pytest.approx(0.001, abs=0.05e-6)
 
 
+def test_zaber_without_its_reference_moves_after_clear_and_says_so(
+    zaber: tuple[ZaberStage, ZaberEmulator, Clock],
+) -> None:
+    stage, emulator, _ = zaber
+    emulator.power_cycle()
+    before = emulator.position_m()
+    stage.clear()
+    state = stage.state()
+    assert (state.kind, state.referenced) == ("idle", False)
+    assert "switched on" in state.text
+    x, y, z = stage.position_m()
+    stage.move_to(x + 0.001, y, z)
+    assert emulator.position_m()[0] - before[0] == pytest.approx(0.001, abs=0.05e-6)
+    emulator.fault(2, "FS")
+    stage.clear()
+    assert not stage.state().referenced
+    stage.home()
+    assert stage.state().referenced
+
+
+def test_zaber_that_insists_on_homing_says_so(
+    zaber: tuple[ZaberStage, ZaberEmulator, Clock],
+) -> None:
+    stage, emulator, _ = zaber
+    emulator.power_cycle()
+    emulator.devices[1].stuck_flags.add("WR")
+    with pytest.raises(DeviceRefused, match="axis 1 takes no moves before home"):
+        stage.clear()
+    assert stage.state().kind == "not_homed"
+
+
 def test_zaber_unplugged(zaber: tuple[ZaberStage, ZaberEmulator, Clock]) -> None:
     stage, emulator, clock = zaber
     clock.run_at(2.0)

@@ -28,7 +28,9 @@ MAX_ENTRIES, MAX_IMAGES = 1824, 256
 MIN_DARK_US = 230
 #: The validation says so often that it is busy.
 BUSY_POLLS = 2
-_STORED = {0x1A1D: bytes([0, 0xBB, 0xBB]), 0x1A1E: bytes([0, 0xBB])}
+#: One count of the trigger input's delay.
+DELAY_COUNT_US = 0.1072
+_STORED = {0x1A1D: bytes([0, 0xBB, 0xBB]), 0x1A1E: bytes([0, 0xBB]), 0x1A35: bytes(4)}
 
 
 class _Refused(Exception):
@@ -228,6 +230,11 @@ class Dlpc350Emulator:
             verdict |= exposure_us < self.model.min_exposure_us[0] or period_us < exposure_us
             verdict |= (plane > 23 or depth != 1) << 1
             verdict |= (0 < period_us - exposure_us <= MIN_DARK_US) << 4
+        # Black (bit 17) must come before a pattern that waits; before the first, the last's.
+        for i, (word, _, _) in enumerate(filter(None, entries)):
+            before = entries[i - 1]
+            if word & 3 in (1, 2) and before is not None:
+                verdict |= (not before[0] >> 17 & 1) << 3
         known = all(self._images.get(i, len(self._flash)) < len(self._flash) for i in range(images))
         first = entries[0]
         if swaps != images or not known or first is None or first[0] & 3 == 3:
@@ -243,7 +250,17 @@ class Dlpc350Emulator:
             raise _Refused("nothing valid to show")
         count, _, endless = self._config
         slots = self._slots(count)
-        self._sequencer.start(Program(slots, 0 if endless else count, 0, self._mirrors_of, 2, 0, 0))
+        (delay,) = struct.unpack("<I", self._registers[0x1A35])
+        self._sequencer.start(
+            Program(
+                slots, 0 if endless else count, 0, self._mirrors_of, 2, 0,
+                trigger_in_delay_us=round(delay * DELAY_COUNT_US),
+            )
+        )  # fmt: skip
+
+    def trigger_in(self, edge_ns: int | None = None) -> bool:
+        """Raise an edge on TRIG_IN_1; False when no pattern waits for it."""
+        return self._sequencer.trigger_in(edge_ns)
 
     def _slots(self, count: int) -> tuple[Slot, ...]:
         slots, swaps = [], 0
@@ -251,7 +268,8 @@ class Dlpc350Emulator:
             swaps += word >> 18 & 1
             image = self._images[swaps - 1]
             dark_us = period_us - exposure_us
-            slots.append(Slot(image, word >> 2 & 0x3F, 1, exposure_us, dark_us, False, True))
+            waits = word & 3 in (1, 2)
+            slots.append(Slot(image, word >> 2 & 0x3F, 1, exposure_us, dark_us, waits, True))
         return tuple(slots)
 
     def _mirrors_of(self, slot: Slot) -> Mirrors:

@@ -116,6 +116,9 @@ class ZaberDevice:
             self.go(0.0, now, homing=True)
         elif verb == "move":
             return self._move(rest, now)
+        elif re.fullmatch(r"set pos \d+", data):
+            self.offset = self.carriage - int(data.split()[-1])
+            self.flags -= {"WR", "WH"}
         else:
             return False, "BADCOMMAND"
         return True, "0"

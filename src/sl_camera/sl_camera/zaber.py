@@ -25,6 +25,7 @@ from sl_camera.zaber_protocol import (
 from sl_projector.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
 
 POLL_S = 0.05
+NO_REFERENCE = "position counts from where it was switched on"
 STILL_S = 5.0  # a move without a time-out is given up after standing still for so long
 
 
@@ -97,6 +98,7 @@ class ZaberStage:
         self._reply: Reply | None = None
         self._activity = ""
         self._held = self._stopped = False
+        self._given_up = False  # the reference, by `clear`; the devices do not remember that
         self._alarm = ""
         self.noise_lines = 0
 
@@ -210,7 +212,7 @@ class ZaberStage:
     def _interpret(self, replies: list[Reply]) -> StageState:
         flags = {reply.flag for reply in replies}
         self._note_faults(flags)
-        referenced = not flags & UNREFERENCED
+        referenced = not flags & UNREFERENCED and not self._given_up
         if self._alarm:
             return StageState("alarm", self._alarm, referenced)
         if self._activity == "homing":
@@ -219,9 +221,9 @@ class ZaberStage:
             return StageState("hold", "halted; resume or stop", referenced)
         if self._activity or any(reply.busy for reply in replies):
             return StageState("moving", "moving", referenced)
-        if not referenced:
+        if flags & UNREFERENCED:
             return StageState("not_homed", "no reference since power-up")
-        return StageState("idle", "", True)
+        return StageState("idle", "" if referenced else NO_REFERENCE, referenced)
 
     def _note_faults(self, flags: set[str]) -> None:
         """A fault stays an alarm until ``clear``, even where the flag goes by itself."""
@@ -288,6 +290,7 @@ class ZaberStage:
             for axis in self._axes[:2]:
                 self._ask(axis, "home")
             self._wait_all_idle(deadline - time.monotonic())
+            self._given_up = False
 
     def move_to(
         self, x_m: float, y_m: float, z_m: float, *, timeout_s: float | None = None
@@ -375,9 +378,28 @@ class ZaberStage:
             time.sleep(POLL_S)
 
     def clear(self) -> None:
-        """``warnings clear`` and ``driver enable``. An axis without reference stays so."""
-        if self.state().kind != "alarm":
-            return
+        """``warnings clear`` and ``driver enable``; then ``set pos`` where there is no reference.
+
+        An axis that does not know where it stands takes no moves. Told that its count is right, it
+        counts from where it was switched on; the ends of its travel are then elsewhere.
+        """
+        kind = self.state().kind
+        if kind == "alarm":
+            self._clear_faults()
+        if kind in ("alarm", "not_homed"):
+            self._give_up_reference()
+
+    def _give_up_reference(self) -> None:
+        for axis in self._axes:
+            if self._ask(axis, "").flag in UNREFERENCED:
+                self._given_up = True
+                self._ask(axis, f"set pos {self._ask(axis, 'get pos').data}")
+                if self._ask(axis, "").flag in UNREFERENCED:
+                    raise DeviceRefused(
+                        f"Zaber device {axis.device} axis {axis.axis} takes no moves before home"
+                    )
+
+    def _clear_faults(self) -> None:
         self._each("warnings clear")
         for axis in self._axes:
             with contextlib.suppress(DeviceRefused):  # firmware 6 has no such command

@@ -89,7 +89,7 @@ class Dlpc350(Dlpc900):
         settings = settings or Dlpc350Settings()
         super().__init__(device, MODEL, settings, backend=backend, clock=clock)
         if settings.trigger_in is not None:
-            raise ConfigError("trigger_in; the DLPC350 driver shows patterns by time only")
+            protocol.trigger_in_delay(settings.trigger_in.delay_s)
         self._flash: Layout = flash_layout(settings.flash)
         self._flashed = ", ".join(sequence.name for sequence in settings.flash) or "nothing"
 
@@ -122,6 +122,28 @@ class Dlpc350(Dlpc900):
         port.write(
             common.TRIGGER_OUT_2, bytes([two.inverted, protocol.delay_count(two.rising_delay_s)])
         )
+        if (trigger := self._settings.trigger_in) is not None:
+            port.write(common.TRIGGER_IN_1, protocol.trigger_in_delay(trigger.delay_s))
+
+    def _checked(self, settings: Dlpc900Settings) -> Dlpc900Settings:
+        return settings
+
+    def _check_timing(self, timing: Timing) -> None:
+        super()._check_timing(timing)
+        if self._settings.trigger_in is not None and not timing.dark_us:
+            raise ConfigError(
+                "no dark time; a DLPC350 needs black before an external trigger, expected at "
+                f"least {self._model.min_dark_us} us"
+            )
+
+    def _trigger(self, index: int, count: int) -> int:
+        """What an entry of the table begins at; every ``count`` it begins anew."""
+        trigger = self._settings.trigger_in
+        if trigger is None:
+            return protocol.BY_TIME
+        if not trigger.waits(index % count):
+            return protocol.FOLLOWS
+        return protocol.FALLING if trigger.falling_edge else protocol.RISING
 
     def status(self) -> ProjectorStatus:
         """See `ProjectorDriver`."""
@@ -212,7 +234,7 @@ class Dlpc350(Dlpc900):
         )
         port.write(protocol.TRIGGER_MODE, bytes([protocol.VARIABLE_INTERNAL]))
         self._write_images(port, images)
-        self._write_patterns(port, shown, timing)
+        self._write_patterns(port, shown, len(places), timing)
         self._validate(port)
 
     def _write_images(self, port: Dlpc900Port, images: list[int]) -> None:
@@ -222,15 +244,16 @@ class Dlpc350(Dlpc900):
         port.write(protocol.MAILBOX, bytes([protocol.CLOSED]))
 
     def _write_patterns(
-        self, port: Dlpc900Port, shown: tuple[tuple[int, int], ...], timing: Timing
+        self, port: Dlpc900Port, shown: tuple[tuple[int, int], ...], count: int, timing: Timing
     ) -> None:
         port.write(protocol.MAILBOX, bytes([protocol.VARIABLE_TABLE]))
         period_us = timing.exposure_us + timing.dark_us
         before = -1
         for index, (image, plane) in enumerate(shown):
             word = protocol.pattern_word(
-                plane, leds=self._settings.leds, swap=image != before, black=timing.dark_us > 0
-            )
+                plane, leds=self._settings.leds, swap=image != before, black=timing.dark_us > 0,
+                trigger=self._trigger(index, count),
+            )  # fmt: skip
             port.write(protocol.VARIABLE_ADDRESS, index.to_bytes(2, "little"))
             entry = protocol.variable_entry(word, timing.exposure_us, period_us)
             port.write(protocol.VARIABLE_ENTRY, entry)

@@ -38,6 +38,7 @@ NAMES = {
 MODE_PATTERN = 1
 FROM_FLASH = 3
 VARIABLE_INTERNAL = 3  # variable exposures, internal or external trigger
+BY_TIME, RISING, FALLING, FOLLOWS = range(4)  # trigger of a pattern
 CLOSED, IMAGE_TABLE, VARIABLE_TABLE = 0, 1, 3
 BUSY = 0x80
 
@@ -52,8 +53,8 @@ _FAULTS = {
 }
 
 
-def pattern_word(plane: int, *, leds: int, swap: bool, black: bool) -> int:
-    """Return the word of a 1-bit pattern: internal trigger, plane, depth 1, LEDs, options.
+def pattern_word(plane: int, *, leds: int, swap: bool, black: bool, trigger: int = BY_TIME) -> int:
+    """Return the word of a 1-bit pattern: trigger, plane, depth 1, LEDs, options.
 
     Parameters
     ----------
@@ -65,8 +66,10 @@ def pattern_word(plane: int, *, leds: int, swap: bool, black: bool) -> int:
         Go on to the next image of the image table first.
     black : bool
         Insert black after the exposure.
+    trigger : {BY_TIME, RISING, FALLING, FOLLOWS}
+        What it begins at; one that follows a triggered pattern shares its trigger.
     """
-    return plane << 2 | 1 << 8 | leds << 12 | black << 17 | swap << 18
+    return trigger | plane << 2 | 1 << 8 | leds << 12 | black << 17 | swap << 18
 
 
 def variable_entry(word: int, exposure_us: int, period_us: int) -> bytes:
@@ -82,6 +85,25 @@ def variable_config(entries: int, images: int, endless: bool) -> bytes:
 def image_table(images: list[int]) -> bytes:
     """Pack the image table. Of exactly two entries the second is sent first (so does TI's code)."""
     return bytes(images[::-1] if len(images) == 2 else images)
+
+
+def trigger_in_delay(delay_s: float) -> bytes:
+    """Pack trigger input 1's delay (0x1A35), in counts of 107.2 ns.
+
+    Raises
+    ------
+    ConfigError
+        When it is negative or does not fit 32 bits.
+
+    Examples
+    --------
+    >>> trigger_in_delay(107.2e-6).hex()
+    'e8030000'
+    """
+    count = round(delay_s / DELAY_COUNT_S)
+    if not 0 <= count <= 0xFFFFFFFF:
+        raise ConfigError(f"trigger input delay is {delay_s} s; expected 0 to 460 s")
+    return struct.pack("<I", count)
 
 
 def delay_count(delay_s: float) -> int:

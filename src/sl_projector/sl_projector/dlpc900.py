@@ -369,8 +369,9 @@ class Dlpc900:
     def _define_patterns(
         self, port: Dlpc900Port, places: tuple[tuple[int, int], ...], timing: Timing
     ) -> None:
-        triggered = self._settings.trigger_in is not None
+        trigger = self._settings.trigger_in
         for index, (image, bit) in enumerate(places):
+            triggered = trigger is not None and trigger.waits(index)
             entry = protocol.lut_entry(
                 index, timing.exposure_us, timing.dark_us, image, bit,
                 leds=self._settings.leds, wait_trigger=triggered, clear=triggered,

@@ -128,10 +128,18 @@ class TriggerOut:
 
 @dataclass(frozen=True)
 class TriggerIn:
-    """External trigger: every pattern waits for an edge on TRIG_IN_1, then for the delay."""
+    """External trigger: every pattern waits for an edge on TRIG_IN_1, then for the delay.
+
+    With ``first_only`` the first pattern of each run of the table does; the others follow by time.
+    """
 
     delay_s: float = 105e-6
     falling_edge: bool = False
+    first_only: bool = False
+
+    def waits(self, index: int) -> bool:
+        """Whether a pattern of the table waits."""
+        return index == 0 or not self.first_only
 
 
 @dataclass(frozen=True)
