@@ -20,8 +20,19 @@ require_ros()
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from sl_interfaces.msg import ScanReport  # noqa: E402
 
-from sl_bringup.bags import CAMERA_INFO, FRAME, PROJECTOR_INFO, RECORDED_TOPICS, open_bag  # noqa: E402
+from sl_bringup.bags import (  # noqa: E402
+    CALIBRATION_RUN,
+    CAMERA_INFO,
+    CAMERA_SETTINGS,
+    FRAME,
+    MATCHING,
+    PROJECTOR_INFO,
+    RECORDED_TOPICS,
+    SETTINGS,
+    open_bag,
+)
 from sl_bringup.cli import main  # noqa: E402
+from sl_camera.matching import MatcherSettings  # noqa: E402
 from sl_camera.synchronizer_node import SynchronizerNode  # noqa: E402
 from sl_projector.base_node import EVENTS, LARGE  # noqa: E402
 from sl_reconstruct.reconstruct_node import ReconstructNode  # noqa: E402
@@ -30,6 +41,8 @@ from test_slrig_graph import READY_PATIENCE_S, Command  # noqa: E402
 pytestmark = pytest.mark.xdist_group("graph")
 
 SCANS = 2
+#: Nothing is calibrated here.
+OF_SCANS = [topic for topic in RECORDED_TOPICS if topic is not CALIBRATION_RUN]
 #: More than the recorder needs to find every publisher.
 DISCOVERY_S = 2.5
 
@@ -81,11 +94,18 @@ def test_the_evaluation_gives_the_live_bits(live: tuple[Path, list], tmp_path: P
 def test_every_topic_is_in_the_bag(live: tuple[Path, list]) -> None:
     folder, _ = live
     with open_bag(folder / "whole") as bag:
-        assert [t.name for t in RECORDED_TOPICS if not bag.has(t)] == []
+        assert [t.name for t in OF_SCANS if not bag.has(t)] == []
         frames = [m.message for m in bag.messages(FRAME)]
         assert sum(m.status == m.MATCHED for m in frames) == 11 * SCANS
         assert len(list(bag.messages(CAMERA_INFO))) == 11 * SCANS
         assert list(bag.messages(PROJECTOR_INFO))
+        (camera,), (matching,), (settings,) = (
+            [json.loads(m.message.data) for m in bag.messages(topic)]
+            for topic in (CAMERA_SETTINGS, MATCHING, SETTINGS)
+        )
+        assert camera["full_scale_dn"] == 255
+        assert matching == MatcherSettings().to_dict()
+        assert settings["estimator"] == "matched"
 
 
 def test_a_killed_recorder_leaves_all_but_the_last_second(
@@ -96,7 +116,7 @@ def test_a_killed_recorder_leaves_all_but_the_last_second(
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["lost"]
     assert main(["repair", str(folder / "killed"), "--output", str(tmp_path / "mended")]) == 0
     with AnyReader([tmp_path / "mended"]) as reader:
-        assert {c.topic for c in reader.connections} == {f"/sl/{t.name}" for t in RECORDED_TOPICS}
+        assert {c.topic for c in reader.connections} == {f"/sl/{t.name}" for t in OF_SCANS}
 
 
 def test_a_replay_gives_the_live_bits(live: tuple[Path, list]) -> None:

@@ -21,7 +21,8 @@ def add_parser(subparsers: Any) -> None:
         help="record what an evaluation needs",
         description="Record triggers, images, poses, calibration, settings and results of the "
         "running graph until Ctrl-C, as rosbag2 (mcap). What is older than a second is safe even "
-        "when the recorder is killed. The exit status is 0 only when nothing was lost.",
+        "when the recorder is killed; `slrig repair` makes a whole recording of what it left. The "
+        "exit status is 0 only when nothing was lost.",
         epilog="examples:\n"
         "  slrig record --output bag\n"
         "  slrig record --output bag --split 2GB\n"

@@ -21,7 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from sl_bringup.bag_recorder import BagRecorder
 from sl_bringup.bag_writer import topic_qos
-from sl_bringup.bags import IMAGE, RECORDED_TOPICS, Topic
+from sl_bringup.bags import IMAGE, RECORDED_TOPICS, TOPICS, Topic
 from sl_bringup.progress import StatusLine, complain, say
 from sl_bringup.version import software_version
 from sl_projector.errors import BagError, SlError
@@ -54,6 +54,7 @@ class RecordNode(Node):  # type: ignore[misc]  # rclpy carries no types
         self._bag = bag
         self._refused: set[str] = set()
         self._images = f"{namespace}/{IMAGE.name}"
+        self._needed = [f"{namespace}/{topic.name}" for topic in TOPICS]
         self.lost: Counter[str] = Counter()
         #: Why nothing can be written any more; empty while all is well.
         self.fault = ""
@@ -76,8 +77,8 @@ class RecordNode(Node):  # type: ignore[misc]  # rclpy carries no types
         return f"{line}, {sum(self.lost.values())} lost" if self.lost else line
 
     def silent(self) -> list[str]:
-        """Topics without a publisher."""
-        return [name for name in self._bag.counts if not self.count_publishers(name)]
+        """Topics without a publisher that an evaluation needs."""
+        return [name for name in self._needed if not self.count_publishers(name)]
 
     def _subscribe(self, name: str, topic: Topic, latched: bool) -> None:
         kind = message_type(topic.msgtype)
