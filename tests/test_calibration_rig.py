@@ -190,7 +190,8 @@ def test_the_worst_case_passes_the_gate(worst) -> None:  # type: ignore[no-untyp
     figures = solution.figures()
     verdict = judge(figures, Limits())
     assert verdict.passed, verdict.reasons
-    assert set(figures) == set(Limits.__dataclass_fields__)
+    # Where no lens is kept, its limit has nothing to limit.
+    assert set(figures) == set(Limits.__dataclass_fields__) - {"kept_lens_sigmas"}
     grown = judge(figures | {"left_out_z_m": 1e-5, "hole_rms_px": np.nan}, Limits())
     assert not grown.passed
     assert [reason.split()[0] for reason in grown.reasons] == ["hole_rms_px", "left_out_z_m"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,100 +10,26 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibration_scenes import CAMERA, RIG, Scene
+from calibration_bench import HEIGHTS_M, PLACES, START, Bench
+from calibration_scenes import RIG
 from plate_scenes import drawn, pinhole
+from sl_bench.optics import Optics
+from sl_bench.surfaces import make_surface
+from sl_bench.world import World
 from sl_bringup.calibrate import outcome_lines
 from sl_bringup.paper_tables import table_1_lines
-from sl_calibration.calibrator import Calibrator, Outcome, Pitches, solve_stored
+from sl_calibration.conclude import solve_stored
+from sl_calibration.detect import find_plate
 from sl_calibration.observe import observe, white_image
-from sl_calibration.plate import Plate
-from sl_calibration.session import Order, Progress, RunCancelled, Taken
+from sl_calibration.plate import DEFAULT_PLATE, Plate
+from sl_calibration.session import Order, Taken
 from sl_calibration.store import CALIBRATION, OBSERVATIONS, Store
 from sl_calibration.uncertainty import Limits
 from sl_calibration.verify import triangulate
-from sl_calibration.views import View, load_observations
+from sl_calibration.views import load_observations
 from sl_projector.errors import CalibrationError, DeviceRefused, SequenceError
 from sl_projector.sequence import Pattern, PatternSequence, named
 from sl_reconstruct.calibration_file import load_calibration, rig_hash
-
-HEIGHTS_M = (-1e-3, -0.5e-3, 0.0, 0.5e-3, 1e-3)
-PITCHES = Pitches(RIG.camera.pixel_pitch_m, RIG.projector.pixel_pitch_m)
-SEQUENCE = named("precise-rows")
-START_M = 0.2e-3
-
-
-class FakeRig:
-    """Stage, projector and camera that do as they are told, or not."""
-
-    def __init__(self) -> None:
-        self.height_m = START_M
-        self.plate_m: float | None = None  # where the plate is, if not where the stage says
-        self.travel_m = (-0.01, 0.01)
-        self.moves: list[float] = []
-        self.halted = False
-        self.stuck = False
-        self.cancel_after: int | None = None
-
-    def where(self) -> float:
-        return self.height_m
-
-    def check(self, height_m: float) -> None:
-        low, high = self.travel_m
-        if not low <= height_m <= high:
-            raise CalibrationError(f"the stage does not reach {height_m * 1e3:.4f} mm")
-
-    def move(self, height_m: float) -> float:
-        if self.cancel_after == len(self.moves):
-            raise RunCancelled("calibration cancelled")
-        self.moves.append(height_m)
-        if not self.stuck:
-            self.height_m = height_m
-        return self.height_m
-
-    def take(self, sequence: str) -> Taken:
-        assert sequence == "precise-rows"
-        width, height = CAMERA.image_size
-        images = np.broadcast_to(np.uint8(0), (len(SEQUENCE), height, width))
-        return Taken(images, SEQUENCE, self.height_m)
-
-    def halt(self) -> None:
-        self.halted = True
-
-
-def look_with(rig: FakeRig, noise_px: float = 0.01) -> Callable[[Taken, Order], View]:
-    """What is seen of the plate: computed, not rendered."""
-    scene = Scene(hole_noise_px=noise_px)
-    rng = np.random.default_rng(7)
-
-    def look(taken: Taken, order: Order) -> View:
-        height_m = taken.height_m if rig.plate_m is None else rig.plate_m
-        stage_m = np.array([0.0, 0.0, height_m])
-        holes, thrown = scene.holes(rng, stage_m), scene.thrown(rng, stage_m)
-        ids = np.stack(np.meshgrid(range(10), range(10)), axis=-1).reshape(-1, 2)
-        return View(
-            taken.height_m, ids, holes.plate_xy_m, holes.pixels, holes.sigma_px[:, 0],
-            thrown.camera_px, thrown.projector_px, thrown.sigma_px, 0.02,
-        )  # fmt: skip
-
-    return look
-
-
-class Bench:
-    """A calibrator on a fake rig."""
-
-    def __init__(self, directory: Path) -> None:
-        self.rig = FakeRig()
-        self.store = Store(directory)
-        self.told: list[Progress] = []
-
-    def calibrate(
-        self, heights_m: tuple[float, ...] = HEIGHTS_M, limits: Limits | None = None,
-        noise_px: float = 0.01, target: str = "both",
-    ) -> Outcome:  # fmt: skip
-        look = look_with(self.rig, noise_px)
-        calibrator = Calibrator(self.store, limits or Limits(), PITCHES, look=look)
-        order = Order(target, heights_m, Plate(), "precise-rows")
-        return calibrator.calibrate(self.rig, order, None, self.told.append)
 
 
 @pytest.fixture
@@ -115,7 +40,7 @@ def bench(tmp_path: Path) -> Bench:
 def test_an_accepted_run_is_in_force_with_all_its_evidence(bench: Bench) -> None:
     outcome = bench.calibrate()
     assert outcome.success, outcome.message
-    assert bench.rig.moves == [*HEIGHTS_M, START_M]
+    assert bench.rig.moves == [*PLACES, START]
     file = bench.store.current()
     assert file == Path(outcome.calibration_file)
     stored = load_calibration(file)
@@ -222,7 +147,7 @@ def test_a_stage_that_only_says_it_moves_is_known_by_the_images(bench: Bench) ->
     outcome = bench.calibrate()
     assert "view 2 of 5" in outcome.message
     assert "does not move" in outcome.message
-    assert bench.rig.height_m == START_M
+    assert bench.rig.place == START
     assert bench.store.current() is None
 
 
@@ -233,7 +158,7 @@ def test_a_cancelled_run_stops_the_stage_and_leaves_the_old_calibration(bench: B
     outcome = bench.calibrate()
     assert (outcome.success, outcome.cancelled) == (False, True)
     assert bench.rig.halted
-    assert bench.rig.moves == list(HEIGHTS_M[:2])
+    assert bench.rig.moves == PLACES[:2]
     assert bench.store.current() == Path(first.calibration_file)
 
 
@@ -244,11 +169,10 @@ def test_a_device_that_fails_is_the_answer_and_the_stage_goes_back(bench: Bench)
     bench.rig.take = take  # type: ignore[method-assign]
     outcome = bench.calibrate()
     assert outcome.message == "the projector is busy"
-    assert bench.rig.moves == [HEIGHTS_M[0], START_M]
+    assert bench.rig.moves == [PLACES[0], START]
 
 
-def test_one_device_alone_is_refused(bench: Bench) -> None:
-    assert "expected 'both'" in bench.calibrate(target="camera").message
+def test_an_unknown_device_is_refused() -> None:
     with pytest.raises(CalibrationError, match="target='lens'"):
         Order("lens", HEIGHTS_M, Plate(), "precise-rows")
 
@@ -273,6 +197,34 @@ def test_a_missing_plate_is_named() -> None:
     bare = np.random.default_rng(1).normal(190.0, 1.0, (300, 400)).astype(np.uint8)
     with pytest.raises(CalibrationError, match="holes"):
         seen(bare)
+
+
+def test_the_bench_s_plate_turned_over_is_named(tmp_path: Path) -> None:
+    """The default plate, really turned over on the bench, by the default parameters."""
+    surface = make_surface("hole_plate", turned_over=True)
+    back = World(RIG, surface, Optics()).expose(
+        [(np.ones(RIG.projector.image_size[::-1], np.uint8), 1 / 30)], 1 / 30, 0
+    )
+    with pytest.raises(CalibrationError, match=r"turned over.* with the mark at hole \(1, 0\)"):
+        find_plate(back, DEFAULT_PLATE)
+    # Without a mark nobody can tell.
+    assert len(find_plate(back, Plate()).ids) >= 99
+
+
+def test_a_mark_that_is_covered_is_asked_for() -> None:
+    plate = replace(MARKED, origin_diameter_m=None)
+    image = drawn(plate, pinhole(tilt_deg=20.0, scale=38e3))
+    with pytest.raises(CalibrationError, match="none of 63 holes has the size of the origin mark"):
+        find_plate(image, MARKED)
+
+
+def test_which_marks_tell_a_plate_s_back() -> None:
+    assert DEFAULT_PLATE.tells_its_back
+    assert MARKED.tells_its_back  # a corner, but 9 x 7
+    for origin in ((0, 0), (9, 0), (3, 6)):
+        assert not replace(DEFAULT_PLATE, origin_id=origin).tells_its_back
+    assert not replace(MARKED, origin_id=(4, 2)).tells_its_back
+    assert not Plate().tells_its_back
 
 
 def test_a_plate_turned_over_is_named() -> None:

@@ -14,7 +14,7 @@ from sl_bench.reference import reference_rig
 from sl_bench.surfaces import make_surface
 from sl_bench.world import World
 from sl_calibration.detect import find_plate
-from sl_calibration.plate import HoleFlag, Plate
+from sl_calibration.plate import DEFAULT_PLATE, HoleFlag, Plate
 from sl_calibration.plate_map import map_circles
 from sl_projector.errors import CalibrationError
 
@@ -49,7 +49,7 @@ def bench():
 
 @pytest.fixture(scope="module")
 def views(bench):
-    return [find_plate(lit(bench, frame), Plate()) for frame in range(3)]
+    return [find_plate(lit(bench, frame), DEFAULT_PLATE) for frame in range(3)]
 
 
 # -- the reference bench -------------------------------------------------------------------------
@@ -93,7 +93,7 @@ def test_ellipse_centres_alone_would_miss_the_limit(bench, views):
 
 
 def test_turned_tilted_and_partly_out_of_view():
-    surface = make_surface("hole_plate", origin_diameter_m=0.62e-3)
+    surface = make_surface("hole_plate", origin_diameter_m=0.62e-3, origin_id=(0, 0))
     world = World(reference_rig(), surface, Optics(seed=3))
     a = np.deg2rad(127.0)
     turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1.0]])
@@ -109,10 +109,10 @@ def test_blocked_and_damaged_holes_do_not_pull_the_others():
     world = World(reference_rig(), make_surface("hole_plate", blocked=blocked), Optics(seed=5))
     image = lit(world).astype(np.float64)
     damaged = np.array([[4, 4], [0, 9], [8, 1]])
-    for u, v in truth_px(world, Plate().xy_m(damaged)):  # a chip of 10 px out of the edge
+    for u, v in truth_px(world, DEFAULT_PLATE.xy_m(damaged)):  # a chip of 10 px out of the edge
         spot = np.hypot(*np.meshgrid(np.arange(1600) - u - 24, np.arange(1200) - v)) < 10
         image[spot] = 8.0
-    view = find_plate(image.astype(np.uint8), Plate())
+    view = find_plate(image.astype(np.uint8), DEFAULT_PLATE)
     assert {tuple(k) for k in view.missing} == set(blocked)
     bad = {tuple(k) for k in view.ids[~view.good]}
     assert bad == {tuple(k) for k in damaged}
@@ -122,7 +122,7 @@ def test_blocked_and_damaged_holes_do_not_pull_the_others():
 def test_uneven_light_does_not_move_centres():
     # 30 % of the light is left at the corners; the sensor is not saturated in the middle
     world = World(reference_rig(), make_surface("hole_plate"), Optics(uneven_light=0.7, seed=2))
-    view = find_plate(lit(world), Plate())
+    view = find_plate(lit(world), DEFAULT_PLATE)
     assert view.good.sum() >= 98
     assert np.abs(errors_px(world, view)[view.good]).max() < LIMIT_PX
 
@@ -130,7 +130,7 @@ def test_uneven_light_does_not_move_centres():
 def test_saturation_is_said_and_priced():
     # The middle of the plate is saturated, its border is not.
     world = World(reference_rig(), make_surface("hole_plate"), Optics(white_dn=250.0, seed=1))
-    view = find_plate(lit(world), Plate())
+    view = find_plate(lit(world), DEFAULT_PLATE)
     full = (view.flags & HoleFlag.SATURATED) > 0
     assert 5 < full.sum() < 100
     assert view.sigma_px[full].min() > 1.5 * np.median(view.sigma_px[~full])

@@ -84,7 +84,8 @@ def test_hole_plate_lies_in_view_and_has_the_holes_it_is_asked_for():
 
 
 def test_chamfer_is_a_cone():
-    plate = make_surface("hole_plate", chamfer_m=60e-6, origin_diameter_m=0.6e-3)
+    mark = {"origin_diameter_m": 0.6e-3, "origin_id": (0, 0)}
+    plate = make_surface("hole_plate", chamfer_m=60e-6, **mark)
     x0, y0 = plate.centres_m[0, 0]
     x = x0 + np.array([0.30e-3, 0.33e-3, 0.36e-3, 0.40e-3])
     heights = plate.height_m(x, np.full(4, y0))

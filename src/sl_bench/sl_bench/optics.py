@@ -135,13 +135,15 @@ class Finish:
 FINISHES: dict[str, Finish] = {
     "matt": Finish(),
     "painted": Finish(diffuse=1.0, texture=0.05),
+    # A sheen on it: on the reference rig one side of a flat is saturated.
+    "glossy": Finish(diffuse=1.0, specular=4.0, lobe_deg=4.5),
     # On the reference rig a flat's half vector is 8 to 16 degrees off its normal: partly saturated.
     "metal": Finish(diffuse=0.35, specular=6.0, lobe_deg=7.0, texture=0.15, texture_m=25e-6),
 }
 
 
 def make_finish(name: str) -> Finish:
-    """Return a finish by name: matt, painted or metal.
+    """Return a finish by name: matt, painted, glossy or metal.
 
     Raises
     ------

@@ -81,7 +81,7 @@ def _heights(data, x, y):  # type: ignore[no-untyped-def]
 def _albedos(data, x, y):  # type: ignore[no-untyped-def]
     out = np.empty(x.size)
     for i in range(x.size):
-        out[i] = raycast.albedo(data, x[i], y[i], 0.0)
+        out[i] = raycast.albedo(data, x[i], y[i])
     return out
 
 
@@ -275,8 +275,10 @@ def hole_plate(
     rows: int = 10,
     chamfer_m: float = 0.0,
     hole_albedo: float = 0.02,
-    origin_diameter_m: float | None = None,
+    origin_diameter_m: float | None = 0.6e-3,
+    origin_id: tuple[int, int] = (1, 0),
     blocked: Iterable[tuple[int, int]] = (),
+    turned_over: bool = False,
 ) -> HolePlate:
     """Return a plate with dark round holes on a square lattice centred on the origin.
 
@@ -291,9 +293,15 @@ def hole_plate(
     hole_albedo : float
         Reflectance in the hole, relative to the plate's.
     origin_diameter_m : float, optional
-        Another diameter for hole (0, 0), the one at the smallest x and y.
+        Another diameter for one hole, the mark; None (or 0) for no mark.
+    origin_id : (column, row)
+        The mark; (0, 0) is the hole at the smallest x and y. Next to a corner it shows which side
+        of the plate is up.
     blocked : iterable of (column, row)
         Holes that are not there.
+    turned_over : bool
+        The plate lies on its face, turned about y: its holes go through, so that its back shows
+        them mirrored in x.
     """
     _check(columns >= 2 and rows >= 2, "columns, rows", (columns, rows), "at least 2")
     widest = max(diameter_m, origin_diameter_m or 0.0)
@@ -301,13 +309,13 @@ def hole_plate(
     _check(chamfer_m >= 0.0 and widest + 2 * chamfer_m < pitch_m, "widest hole", widest, "< pitch")
     _check(0.0 <= hole_albedo <= 1.0, "hole_albedo", hole_albedo, "in [0, 1]")
     radii = np.full((rows, columns), diameter_m / 2, dtype=np.float64)
-    if origin_diameter_m is not None:
-        radii[0, 0] = origin_diameter_m / 2
-    for column, row in blocked:
-        _check(
-            0 <= column < columns and 0 <= row < rows, "blocked", (column, row), "in the lattice"
-        )
-        radii[row, column] = 0.0
+    marked = [(*origin_id, origin_diameter_m / 2)] if origin_diameter_m else []
+    for column, row, radius in [*marked, *((*hole, 0.0) for hole in blocked)]:
+        inside = 0 <= column < columns and 0 <= row < rows
+        _check(inside, "blocked, origin_id", (column, row), "in the lattice")
+        radii[row, column] = radius
+    if turned_over:
+        radii = np.ascontiguousarray(radii[:, ::-1])
     middle = ((columns - 1) / 2, (rows - 1) / 2)
     data = raycast.SurfaceData(
         raycast.HOLES, _params(pitch_m, chamfer_m, hole_albedo, *middle), _NO_PROFILE, radii,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import math
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from sl_projector.documents import read_document
 from sl_projector.errors import ConfigError
 
 if TYPE_CHECKING:
-    from sl_calibration.calibrator import Outcome
+    from sl_calibration.conclude import Outcome
 
 CLIENT = "sl_bringup.calibrate_node"
 INTERRUPTED = 130
@@ -29,34 +30,48 @@ def add_parser(subparsers: Any) -> None:
         help="calibrate the rig on the hole plate",
         description="Ask the graph to calibrate: the plate at several heights, camera and "
         "projector, uncertainty, verdict, report. The exit status is 0 only when a calibration "
-        "was accepted and is in force. With --from, observations that were stored are solved "
-        "again, without a graph; nothing is put in force then.",
+        "was accepted and is in force. With --from, a recording (slrig record, during the run) or "
+        "the observations in a run's folder are solved again, without a graph; nothing is put in "
+        "force then.",
         epilog="examples:\n"
         "  slrig calibrate\n"
         "  slrig calibrate --heights-mm -1 -0.5 0 0.5 1\n"
+        "  slrig calibrate --target projector\n"
+        "  slrig calibrate --verify --heights-mm -0.8 0 0.8\n"
         "  slrig calibrate --from calibrations/2026-01-31_120000_run --output again\n"
+        "  slrig calibrate --from recorded_bag --output again\n"
+        "  slrig calibrate --from calibrations/2026-01-31_120000_run --opencv rig.xml\n"
         "  slrig calibrate --up --bench --surface hole_plate",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "--from", dest="source", type=Path, metavar="DIR",
-        help="solve the observations in this run's folder again, offline",
+        "--from", dest="source", type=Path, metavar="RUN|BAG",
+        help="solve this run's folder, or the calibration in this recording, again, offline",
     )  # fmt: skip
     parser.add_argument("--output", type=Path, metavar="DIR", help="with --from: for the results")
     parser.add_argument(
+        "--opencv", type=Path, metavar="FILE",
+        help="with --from: write the run's calibration for OpenCV (.xml, .yml, .json) instead",
+    )  # fmt: skip
+    parser.add_argument(
         "--heights-mm", type=float, nargs="+", default=[], metavar="Z",
-        help="stage heights of the views (default: the node's)",
+        help="stage heights of the views (default: the node's), or to verify at",
     )  # fmt: skip
     parser.add_argument(
         "--target",
         choices=["both", "camera", "projector"],
         default="both",
-        help="what to calibrate",
+        help="what to calibrate; one device alone: the other keeps its lens",
     )
+    parser.add_argument(
+        "--keep", type=Path, metavar="FILE",
+        help="with --target: calibration whose other device is kept (default: the one in force)",
+    )  # fmt: skip
     parser.add_argument("--sequence", default="", help="patterns, both axes (default: the node's)")
     parser.add_argument(
-        "--verify", action="store_true", help="only check the calibration in force on the plate"
-    )
+        "--verify", nargs="?", const="plate", choices=["plate", "flat"],
+        help="only check the calibration in force, on the plate or a flat (default: plate)",
+    )  # fmt: skip
     parser.add_argument(
         "--timeout", type=float, default=600.0, metavar="S", help="for the run (default: 600)"
     )
@@ -78,7 +93,9 @@ def client_arguments(args: argparse.Namespace) -> list[str]:
         words += ["--sequence", args.sequence]
     if args.heights_mm:
         words += ["--heights-m", *(f"{height * 1e-3}" for height in args.heights_mm)]
-    return [*words, "--verify"] if args.verify else words
+    if args.keep:
+        words += ["--keep", str(args.keep.resolve())]
+    return [*words, "--verify", args.verify] if args.verify else words
 
 
 async def calibrate_once(
@@ -129,14 +146,18 @@ def _plate_on_bench(config: Path, options: GraphOptions) -> dict[str, Any]:
     document = read_document(config, ConfigError)
     section = document.get(f"{options.changes.namespace}/calibration", {})
     parameters = section.get("ros__parameters", {})
-    names = ("columns", "rows", "pitch_m", "diameter_m", "chamfer_m")
+    names = ("columns", "rows", "pitch_m", "diameter_m", "chamfer_m", "origin_diameter_m")
     return {n: parameters[f"plate_{n}"] for n in names if f"plate_{n}" in parameters}
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry out ``slrig calibrate``."""
     if args.source is not None:
-        return solve_again(args.source, args.output or args.source / "again")
+        if args.opencv:
+            return export(args.source, args.opencv)
+        return solve_again(args.source, args.output)
+    if args.opencv:
+        raise ConfigError("--opencv writes a run's calibration; expected --from RUN beside it")
     options = graph_options(args)
     client = client_arguments(args)
     if args.up and not is_running(options.directory):
@@ -159,14 +180,37 @@ def _writer(file: Any) -> Callable[[str], None]:
     return tell
 
 
-def solve_again(source: Path, output: Path) -> int:
-    """Solve the observations of a stored run; nothing is put in force."""
-    from sl_calibration.calibrator import solve_stored
+def solve_again(source: Path, output: Path | None) -> int:
+    """Solve a stored run, or the calibration in a recording, again; nothing is put in force."""
+    from sl_bringup.calibrate_bag import solve_recorded
+    from sl_calibration.conclude import solve_stored
+    from sl_calibration.store import OBSERVATIONS
 
-    outcome = solve_stored(source, output)
-    for line in outcome_lines(outcome):
+    stored = source.suffix == ".npz" or (source / OBSERVATIONS).is_file()
+    notes: list[str] = []
+    if stored:
+        outcome = solve_stored(source, output or source.with_suffix("") / "again")
+    else:
+        folder = output or Path(f"{source.stem}_calibration")
+        outcome, notes = solve_recorded(source, folder, tell=complain)
+    for line in [*outcome_lines(outcome), *notes]:
         say(line)
     return 0 if outcome.accepted else 1
+
+
+def export(source: Path, file: Path) -> int:
+    """Write a calibration (a file, or a run's) for OpenCV's tools."""
+    from sl_calibration.opencv_io import opencv_values, save_opencv
+    from sl_calibration.store import CALIBRATION
+    from sl_reconstruct.calibration_file import load_rig
+
+    rig = load_rig(source / CALIBRATION if source.is_dir() else source)
+    save_opencv(file, rig)
+    values = opencv_values(rig)
+    errors = (values[f"{name}_lens_error_px"] for name in ("cam", "proj"))
+    camera, projector = (f"{error:.4f} px" for error in errors)
+    say(f"{file}: OpenCV's lens is off the paper's by {camera} (camera), {projector} (projector)")
+    return 0
 
 
 def outcome_lines(outcome: Outcome | Any) -> list[str]:
@@ -177,6 +221,10 @@ def outcome_lines(outcome: Outcome | Any) -> list[str]:
             f"views             {outcome.views}, {outcome.holes} holes",
             f"camera            {outcome.camera_rms_px:.4f} px, "
             f"{outcome.camera_rms_m * 1e6:.3f} um on the part (rms of the holes)",
+            *_stage_lines(outcome),
+        ]
+    if outcome.projector_rms_px:
+        lines += [
             f"projector         {outcome.projector_rms_px:.4f} px, "
             f"{outcome.projector_rms_m * 1e6:.3f} um on the part (rms of the targets)",
             f"sigma of z        {outcome.predicted_sigma_m * 1e6:.3f} um at worst in the volume",
@@ -189,4 +237,18 @@ def outcome_lines(outcome: Outcome | Any) -> list[str]:
         ]
     if outcome.report:
         lines.append(f"report            {outcome.report}")
+    return lines
+
+
+def _stage_lines(outcome: Outcome | Any) -> list[str]:
+    """Lines that tell what the stage really does."""
+    lean = ", ".join(f"{math.degrees(angle):+.4f}" for angle in outcome.stage_z_lean_rad)
+    lines = [
+        f"stage z           scale off by {(outcome.stage_z_scale - 1) * 1e6:+.0f} ppm, leans by "
+        f"({lean}) deg from the plate's normal"
+    ]
+    square = [math.degrees(angle) for angle in outcome.stage_squareness_rad]
+    if all(map(math.isfinite, square)):
+        xy, xz, yz = square
+        lines.append(f"stage squareness  xy {xy:+.4f}, xz {xz:+.4f}, yz {yz:+.4f} deg off 90")
     return lines

@@ -76,9 +76,9 @@ class CalibrateClient(Node):  # type: ignore[misc]  # rclpy carries no types
             self._until(result.done, _CANCEL_S)
             raise
 
-    def verify(self, patience_s: float) -> Any:
-        """Check the calibration in force on the plate, and return the service's answer."""
-        return self._answer(self._verify.call_async(Verify.Request()), patience_s)
+    def verify(self, request: Verify.Request, patience_s: float) -> Any:
+        """Check the calibration in force, and return the service's answer."""
+        return self._answer(self._verify.call_async(request), patience_s)
 
     def _answer(self, future: Any, patience_s: float) -> Any:
         if not self._until(future.done, patience_s):
@@ -109,30 +109,38 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--target", default="both")
     parser.add_argument("--heights-m", type=float, nargs="+", default=[])
     parser.add_argument("--sequence", default="")
-    parser.add_argument("--verify", action="store_true")
+    parser.add_argument("--keep", default="")
+    parser.add_argument("--verify", default="")
     parser.add_argument("--timeout", type=float, default=600.0)
     parser.add_argument("--connect-timeout", type=float, default=10.0)
     return parser.parse_args(argv)
 
 
 def _calibrate(client: CalibrateClient, args: argparse.Namespace) -> int:
-    goal = Calibrate.Goal(target=args.target, heights_m=args.heights_m, sequence=args.sequence)
+    goal = Calibrate.Goal(
+        target=args.target, heights_m=args.heights_m, sequence=args.sequence, keep=args.keep
+    )
     result = client.calibrate(goal, args.timeout)
     if sys.stderr.isatty():
         sys.stderr.write("\n")
     for line in outcome_lines(result):
         say(line)
-    # On this machine the report lies where the node says.
-    file = Path(result.report).with_suffix(".json")
-    if result.report and file.is_file():
-        say("")
-        for line in table_1_lines(json.loads(file.read_text())):
-            say(line)
+    for line in _table_1(result.report):
+        say(line)
     return 0 if result.success else 1
 
 
+def _table_1(report: str) -> list[str]:
+    """Table 1 of a run, from beside its page; nothing where there is none on this machine."""
+    file = Path(report).with_suffix(".json") if report else None
+    if file is None or not file.is_file():
+        return []
+    return ["", *table_1_lines(json.loads(file.read_text()))]
+
+
 def _verify(client: CalibrateClient, args: argparse.Namespace) -> int:
-    answer = client.verify(args.timeout)
+    request = Verify.Request(target=args.verify, heights_m=args.heights_m)
+    answer = client.verify(request, args.timeout)
     say(answer.message)
     if answer.report:
         say(f"report            {answer.report}")

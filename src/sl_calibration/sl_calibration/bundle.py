@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from sl_calibration.derivatives import (
     PARAMETERS,
     intersect,
+    kappa_of,
     meet,
     moved,
     project,
@@ -55,6 +56,31 @@ class FlatPrior:
 
 
 @dataclass(frozen=True)
+class HeldLens:
+    """The lens of a device that a solution is not to change.
+
+    Parameters
+    ----------
+    name : {"camera", "projector"}
+        The device.
+    values : ndarray, (4,)
+        Focal length (px), image centre (px, px), kappa (px^-2).
+    """
+
+    name: str
+    values: Array
+
+
+#: What a held lens may move by: millionths of what any calibration can tell.
+_HELD = np.array([1e-5, 1e-5, 1e-5, 1e-16])
+
+
+def lens_values(device: Device) -> Array:
+    """Focal length, image centre and kappa (4,) of a device with square pixels."""
+    return np.array([device.focal_length_px[0], *device.image_centre_px, kappa_of(device)])
+
+
+@dataclass(frozen=True)
 class Freedom:
     """What the bundle estimates besides the devices.
 
@@ -66,11 +92,14 @@ class Freedom:
         None where the patterns fall on the plate itself.
     square_pixels : bool
         One focal length (the paper's), or fx and fy.
+    held : HeldLens or None
+        The lens that stays as it is; for square pixels only.
     """
 
     stage: StagePrior = field(default_factory=StagePrior)
     flat: FlatPrior | None = None
     square_pixels: bool = True
+    held: HeldLens | None = None
 
 
 class State(NamedTuple):
@@ -269,7 +298,7 @@ class RigProblem:
         return _in_sigmas(seen.pixels - data.pixels, jacobian, data.sigma_px)
 
     def priors(self, state: State) -> tuple[Array, Array]:
-        """Residuals (K,) of stage and flat against what is known of them, derivatives (K, P)."""
+        """Residuals (K,) of stage, flat and lens against what is known, derivatives (K, P)."""
         parts: list[tuple[Array, Array, slice]] = []
         stage, flat = self.freedom.stage, self.freedom.flat
         for i, axis in enumerate(self.moving):
@@ -282,6 +311,10 @@ class RigProblem:
         if flat is not None:
             sigma = np.array([flat.offset_sigma_m, flat.slope_sigma, flat.slope_sigma])
             parts.append((state.flat / sigma, np.diag(1 / sigma), self.columns["flat"]))
+        if held := self.freedom.held:
+            first = self.columns[held.name].start
+            values = (lens_values(state.devices[self.names.index(held.name)]) - held.values) / _HELD
+            parts.append((values, np.diag(1 / _HELD), slice(first, first + 4)))
         jacobian = np.zeros((sum(len(values) for values, _, _ in parts), self.size))
         row = 0
         for values, block, columns in parts:

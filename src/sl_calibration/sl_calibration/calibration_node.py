@@ -6,28 +6,33 @@ is not accepted, a run that fails or is cancelled, leave the one in force as it 
 
 from __future__ import annotations
 
+import json
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rclpy.action import ActionServer, CancelResponse
 from sl_interfaces.action import Calibrate as CalibrateAction
 from sl_interfaces.msg import RigCalibration
 from sl_interfaces.srv import Calibrate, Verify
+from std_msgs.msg import String
 
-from sl_calibration.calibrator import Calibrator, Outcome, Pitches, VerifyOutcome
+from sl_calibration.calibrator import Calibrator, InForce, Pitches, VerifyOutcome
+from sl_calibration.conclude import Outcome
 from sl_calibration.gear_node import RigGear
-from sl_calibration.plate import Plate
+from sl_calibration.plate import DEFAULT_PLATE, Plate
 from sl_calibration.session import Order, Progress
 from sl_calibration.store import Store, default_directory
 from sl_calibration.uncertainty import Limits
+from sl_calibration.verify import VerifyLimits
 from sl_calibration.warm_up import warm_up_apart
 from sl_projector.base_node import (
     CAMERA_FRAME,
+    EVENTS,
     LATCHED,
     PROJECTOR_FRAME,
     WORLD_FRAME,
@@ -40,6 +45,8 @@ from sl_projector.messages import stamp_from_msg
 from sl_reconstruct.calibration_file import Calibration, load_calibration, parse_calibration
 from sl_reconstruct.messages import rig_to_msg
 from sl_reconstruct.scan_flow import ScanTimeouts
+
+_LimitsT = TypeVar("_LimitsT", Limits, VerifyLimits)
 
 FRAMES = (WORLD_FRAME, CAMERA_FRAME, PROJECTOR_FRAME)
 _HEIGHTS_M = [-1e-3, -0.5e-3, 0.0, 0.5e-3, 1e-3]
@@ -103,14 +110,16 @@ class CalibrationNode(RigNode):
             "stage_tolerance_m", 5e-6, "the stage stands where it was sent within, m", 1e-7, 1e-3
         )
         self._repeats = self.declare("max_repeats", 4, "how often a spoilt stack is repeated", 0, 9)
-        self._verify_limit_m = self.declare(
-            "verify_limit_m", 3e-6, "error beyond which verify says to recalibrate, m", 1e-8, 1e-2
-        )
-        self._limits = self._declare_limits()
+        self._travel_m = self.declare(
+            "travel_m", 0.5e-3, "x and y travel of two views that tell squareness; 0: none, m",
+            0.0, 0.1,
+        )  # fmt: skip
+        self._limits = self._declare_limits(Limits(), "limit", "acceptance")
+        self._verify_limits = self._declare_limits(VerifyLimits(), "verify_limit", "verify")
         self._declare_timeouts()
 
     def _declare_plate(self) -> None:
-        plate = Plate()
+        plate = DEFAULT_PLATE
         self.declare("plate_columns", plate.columns, "holes along x", 3, 200, live=True)
         self.declare("plate_rows", plate.rows, "holes along y", 3, 200, live=True)
         self.declare("plate_pitch_m", plate.pitch_m, "pitch of the holes, m", 0.0, 1.0, live=True)
@@ -118,25 +127,27 @@ class CalibrationNode(RigNode):
             "plate_diameter_m", plate.diameter_m, "diameter of the holes, m", 0.0, 1.0, live=True
         )
         self.declare(
-            "plate_origin_diameter_m", 0.0, "diameter of the hole at the origin, m; 0: no mark",
-            0.0, 1.0, live=True,
+            "plate_origin_diameter_m", plate.origin_diameter_m or 0.0,
+            "diameter of the one hole that marks the origin, m; 0: no mark", 0.0, 1.0, live=True,
         )  # fmt: skip
+        for name, value in zip(("column", "row"), plate.origin_id, strict=True):
+            self.declare(f"plate_origin_{name}", value, f"{name} of the mark", 0, 199, live=True)
         self.declare("plate_chamfer_m", 0.0, "width of the holes' chamfers, m", 0.0, 1.0, live=True)
         self.declare(
             "plate_dark_holes", True, "dark holes in a bright plate; false: bright dots", live=True
         )
 
-    def _declare_limits(self) -> Limits:
-        """Limits of the acceptance gate, each a parameter of its own."""
+    def _declare_limits(self, default: _LimitsT, prefix: str, what: str) -> _LimitsT:
+        """Limits of acceptance or of a check, each a parameter of its own."""
         values = {
             item.name: self.declare(
-                f"limit_{item.name}",
-                float(getattr(Limits(), item.name)),
-                f"acceptance: largest {item.name}",
+                f"{prefix}_{item.name}",
+                float(getattr(default, item.name)),
+                f"{what}: largest {item.name}",
             )
-            for item in fields(Limits)
+            for item in fields(default)
         }
-        return Limits(**values)
+        return type(default)(**values)
 
     def _declare_timeouts(self) -> None:
         default = ScanTimeouts()
@@ -159,9 +170,15 @@ class CalibrationNode(RigNode):
         return self.get_parameter(name).value
 
     def _make_calibrator(self) -> Calibrator:
+        self._runs = self.create_publisher(String, "calibration/run", EVENTS)
         return Calibrator(
-            self._store, self._limits, self._pitches, self._stage_tolerance_m, self._verify_limit_m
-        )
+            self._store, self._limits, self._pitches, self._stage_tolerance_m, self._verify_limits,
+            record=self._publish_run,
+        )  # fmt: skip
+
+    def _publish_run(self, run: Mapping[str, Any]) -> None:
+        """Say as JSON what a run was: a recording then holds what it takes to solve it again."""
+        self._runs.publish(String(data=json.dumps(run)))
 
     # -- the calibration in force -----------------------------------------------------------------
 
@@ -247,12 +264,17 @@ class CalibrationNode(RigNode):
             order = self._order(request)
             self._await_compiler(cancelled)
             with self._gear.in_use(cancelled) as gear:
-                return self._calibrator.calibrate(gear, order, self._in_force, tell)
+                return self._calibrator.calibrate(
+                    gear, order, self._stands(), tell, str(request.keep)
+                )
 
         outcome: Outcome = self._alone(work, Outcome)
         if outcome.success and outcome.calibration is not None:
             self._put_in_force(outcome.calibration, outcome.calibration_file, time.time_ns())
         return outcome
+
+    def _stands(self) -> InForce | None:
+        return InForce(self._in_force, self._source) if self._in_force else None
 
     def _await_compiler(self, cancelled: Callable[[], bool]) -> None:
         """Let the first start on a machine compile once, not twice at the same time."""
@@ -280,7 +302,7 @@ class CalibrationNode(RigNode):
         heights = [float(h) for h in request.heights_m] or list(self._value("heights_m"))
         plate = self._plate(request)
         sequence = request.sequence or str(self._value("sequence"))
-        return Order(request.target or "both", tuple(heights), plate, sequence)
+        return Order(request.target or "both", tuple(heights), plate, sequence, self._travel_m)
 
     def _plate(self, request: Any = None) -> Plate:
         """Plate of the parameters; what a request names is the request's."""
@@ -298,6 +320,7 @@ class CalibrationNode(RigNode):
             diameter_m=number("plate_diameter_m"),
             dark_holes=bool(self._value("plate_dark_holes")),
             origin_diameter_m=self._value("plate_origin_diameter_m") or None,
+            origin_id=(self._value("plate_origin_column"), self._value("plate_origin_row")),
             chamfer_m=self._value("plate_chamfer_m"),
         )
 
@@ -307,17 +330,19 @@ class CalibrationNode(RigNode):
         def work() -> VerifyOutcome:
             plate = self._plate()
             sequence = str(self._value("sequence"))
-            if self._in_force is None:
+            heights_m = tuple(float(h) for h in request.heights_m)
+            in_force = self._stands()
+            if in_force is None:
                 raise CalibrationError(f"nothing to verify: {self._fault}")
             self._await_compiler(self._shutting_down)
             with self._gear.in_use(self._shutting_down) as gear:
                 return self._calibrator.verify(
-                    gear, request.target or "plate", plate, sequence, self._in_force
+                    gear, request.target or "plate", heights_m, plate, sequence, in_force
                 )
 
         outcome = await self.in_worker(lambda: self._alone(work, VerifyOutcome))
-        for name in ("success", "recalibrate", "message", "rms_m", "limit_m", "report"):
-            setattr(response, name, getattr(outcome, name))
+        for item in fields(VerifyOutcome):
+            setattr(response, item.name, getattr(outcome, item.name))
         return response
 
 
@@ -325,7 +350,8 @@ class CalibrationNode(RigNode):
 _ANSWERS = (
     "success", "accepted", "message", "camera_rms_px", "projector_rms_px", "camera_rms_m",
     "projector_rms_m", "predicted_sigma_m", "left_out_rms_m", "views", "holes",
-    "calibration_file", "report", "hash",
+    "calibration_file", "report", "hash", "stage_z_scale", "stage_z_lean_rad",
+    "stage_squareness_rad",
 )  # fmt: skip
 
 

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sl_calibration.bundle import FlatPrior, Freedom
-from sl_calibration.linear import Sensor
+from sl_calibration.camera_file import load_kept
+from sl_calibration.conclude import Outcome, conclude
+from sl_calibration.kept import Kept, keep_of, other_than
 from sl_calibration.observe import observe
 from sl_calibration.plate import Plate
-from sl_calibration.report import write_report, write_verify_report
-from sl_calibration.samples import HoleView, TargetView
+from sl_calibration.report_verify import write_verify_report
 from sl_calibration.session import (
     Gear,
     Order,
@@ -25,14 +25,25 @@ from sl_calibration.session import (
     Session,
     Taken,
     Tell,
+    check_motion,
 )
-from sl_calibration.solution import RigSolution, metres_per_pixel, solve_rig
-from sl_calibration.store import CALIBRATION, OBSERVATIONS, PAGE, Store
-from sl_calibration.uncertainty import EdgeNoise, Limits, Verdict, Volume, judge, sigma_map
-from sl_calibration.verify import Check, check_rig_on, triangulate
-from sl_calibration.views import Observations, View, load_observations, save_observations
+from sl_calibration.store import OBSERVATIONS, PAGE, Store
+from sl_calibration.uncertainty import Limits, judge
+from sl_calibration.verify import (
+    Check,
+    Findings,
+    VerifyLimits,
+    check_rig_on,
+    check_target,
+    default_heights,
+    stage_z_axis,
+)
+from sl_calibration.views import Observations, View, save_observations
 from sl_projector.errors import CalibrationError, SlError
-from sl_reconstruct.calibration_file import Calibration, save_calibration
+from sl_reconstruct.calibration_file import Calibration
+
+NAN = float("nan")
+_NO_SIDE = "not checked: no mark of this plate tells its face from its back"
 
 
 @dataclass(frozen=True)
@@ -41,28 +52,6 @@ class Pitches:
 
     camera_m: float
     projector_m: float
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a run; the fields that the service answers with carry its names."""
-
-    message: str
-    success: bool = False
-    accepted: bool = False
-    cancelled: bool = False
-    camera_rms_px: float = 0.0
-    projector_rms_px: float = 0.0
-    camera_rms_m: float = 0.0
-    projector_rms_m: float = 0.0
-    predicted_sigma_m: float = 0.0
-    left_out_rms_m: float = 0.0
-    views: int = 0
-    holes: int = 0
-    calibration_file: str = ""
-    report: str = ""
-    hash: str = ""
-    calibration: Calibration | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -75,40 +64,21 @@ class VerifyOutcome:
     rms_m: float = 0.0
     limit_m: float = 0.0
     report: str = ""
+    views: int = 0
+    flatness_m: float = NAN
+    ray_gap_m: float = NAN
+    lattice_m: float = NAN
+    pitch_error: float = NAN
+    step_m: float = NAN
+    z_scale_error: float = NAN
 
 
 @dataclass(frozen=True)
-class Solved:
-    """A solution, its verdict and how long it took."""
+class InForce:
+    """The calibration in force and where it comes from."""
 
-    observations: Observations
-    solution: RigSolution
-    verdict: Verdict
-    limits: Limits
-    seconds: float
-
-    @property
-    def edge_noise(self) -> EdgeNoise:
-        """Noise of a point's edge, as it was found on the plate."""
-        edges = [v.edge_sigma_px for v in self.observations.views if np.isfinite(v.edge_sigma_px)]
-        return EdgeNoise(float(np.median(edges))) if edges else EdgeNoise()
-
-    @property
-    def volume(self) -> Volume:
-        """Box of everything that the projector lit and the camera saw."""
-        return lit_volume(self.solution)
-
-    @property
-    def predicted_sigma_m(self) -> float:
-        """Predicted 1-sigma of a point's z, edge noise included, worst in the volume."""
-        sigma = sigma_map(self.solution.joint, self.volume, self.edge_noise)[1]
-        return float(np.nanmax(sigma[..., 2]))
-
-    @property
-    def left_out_rms_m(self) -> float:
-        """Error of z at heights left out, rms of all; NaN where there were too few."""
-        errors = [left.z_rms_m for left in self.solution.left_out]
-        return float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan")
+    calibration: Calibration
+    source: str
 
 
 class Calibrator:
@@ -124,10 +94,12 @@ class Calibrator:
         Of camera and DMD.
     stage_tolerance_m : float
         The stage stands where it was sent within this.
-    verify_limit_m : float
-        Error beyond which a check asks for a new calibration.
+    verify_limits : VerifyLimits
+        Figures beyond which a check asks for a new calibration.
     look : callable
         Makes a view of a stack.
+    record : callable
+        Called with what is needed to make a run again from a recording, plain values.
     """
 
     def __init__(
@@ -136,93 +108,209 @@ class Calibrator:
         limits: Limits,
         pitches: Pitches,
         stage_tolerance_m: float = 5e-6,
-        verify_limit_m: float = 3e-6,
+        verify_limits: VerifyLimits | None = None,
         look: Callable[[Taken, Order], View] = observe,
+        record: Callable[[Mapping[str, Any]], None] = lambda _: None,
     ) -> None:
         self._store, self._limits, self._pitches = store, limits, pitches
-        self._stage_tolerance_m, self._verify_limit_m = stage_tolerance_m, verify_limit_m
-        self._observe = look
+        self._stage_tolerance_m = stage_tolerance_m
+        self._verify_limits = verify_limits or VerifyLimits()
+        self._observe, self._record = look, record
+
+    # -- calibrate --------------------------------------------------------------------------------
 
     def calibrate(
-        self, gear: Gear, order: Order, in_force: Calibration | None, tell: Tell
+        self, gear: Gear, order: Order, in_force: InForce | None, tell: Tell, keep: str = ""
     ) -> Outcome:
         """Take views, solve, judge, store; in force only when accepted.
 
-        Never raises an `SlError`: what went wrong is the outcome's message.
+        Parameters
+        ----------
+        gear : Gear
+            The devices.
+        order : Order
+            What is asked for.
+        in_force : InForce or None
+            Calibration in force: the device that is not asked for keeps its lens of it.
+        tell : callable
+            Called with each change of progress.
+        keep : str
+            Calibration file whose device is kept instead.
+
+        Returns
+        -------
+        Outcome
+            Never an `SlError`: what went wrong is its message.
         """
         try:
-            if order.target != "both":
-                raise CalibrationError(
-                    f"target={order.target!r}: one device cannot be calibrated without the other "
-                    "on this rig, since both share the plate's world; expected 'both'"
-                )
-            return self._run(gear, order, tell)
+            kept = self._kept(order.target, in_force, keep)
+            # Without a projector to be kept, a camera needs no patterns.
+            order = replace(order, patterns=order.target != "camera" or kept is not None)
+            return self._run(gear, order, kept, tell)
         except RunCancelled as error:
-            kept = "the calibration in force stays" if in_force else "nothing is in force"
-            return Outcome(f"{error}; stage and projector were stopped, {kept}", cancelled=True)
+            stays = "the calibration in force stays" if in_force else "nothing is in force"
+            return Outcome(f"{error}; stage and projector were stopped, {stays}", cancelled=True)
         except SlError as error:
             return Outcome(str(error))
 
-    def _run(self, gear: Gear, order: Order, tell: Tell) -> Outcome:
-        sizes: list[tuple[tuple[int, int], tuple[int, int]]] = []
+    def _kept(self, target: str, in_force: InForce | None, keep: str) -> Kept | None:
+        """Lens of the device that is not asked for; None where both are, or there is none yet."""
+        if target == "both":
+            return None
+        name = other_than(target)
+        waiting = self._store.camera() if name == "camera" else None
+        if keep or waiting:
+            return load_kept(Path(keep) if keep else Path(waiting or ""), name)
+        if in_force:
+            return keep_of(in_force.calibration, name, in_force.source)
+        if target == "projector":
+            raise CalibrationError(
+                "target='projector', but no calibrated camera is in force or named; expected one: "
+                "calibrate the 'camera' first, or 'both'"
+            )
+        return None
+
+    def _run(self, gear: Gear, order: Order, kept: Kept | None, tell: Tell) -> Outcome:
+        stacks: list[Taken] = []
 
         def look(taken: Taken, asked: Order) -> View:
-            height, width = taken.images.shape[1:]
-            sizes.append(((width, height), taken.sequence.dmd_size))
-            return self._observe(taken, asked)
+            view = self._observe(taken, asked)
+            # Sizes and number are needed later; the images would fill the memory.
+            stacks.append(replace(taken, images=np.empty((0, *taken.images.shape[1:]))))
+            return view
 
-        taken = Session(gear, order, look, tell, self._stage_tolerance_m).views()
-        camera_size, dmd_size = sizes[0]
+        order, refused = _within_travel(gear, order)
+        made_from = {**made_from_order(order, kept), **refused}
+        try:
+            session = Session(gear, order, look, tell, self._stage_tolerance_m, check_motion)
+            views = session.views()
+            outcome = self._solved(views, stacks[0], made_from, tell)
+        except SlError as error:
+            self._note(stacks, made_from, Outcome(str(error)))
+            raise
+        self._note(stacks, made_from, outcome)
+        return outcome
+
+    def _solved(
+        self, views: tuple[View, ...], stack: Taken, made_from: Mapping[str, Any], tell: Tell
+    ) -> Outcome:
+        height, width = stack.images.shape[1:]
         observations = Observations(
-            taken, camera_size, dmd_size, self._pitches.camera_m, self._pitches.projector_m,
-            _made_from(order),
+            views, (width, height), stack.sequence.dmd_size, self._pitches.camera_m,
+            self._pitches.projector_m, made_from,
         )  # fmt: skip
         folder = self._store.new_run()
         save_observations(folder / OBSERVATIONS, observations)
-        count = len(taken)
-        tell(Progress("solve", count, count, 0.85))
+        tell(Progress("solve", len(views), len(views), 0.85))
         outcome = conclude(observations, self._limits, folder, tell)
-        if outcome.accepted:
+        if outcome.camera_alone:
+            self._store.put_camera(folder)
+        elif outcome.accepted:
             self._store.put_in_force(folder)
-        tell(Progress("store", count, count, 1.0))
+        tell(Progress("store", len(views), len(views), 1.0))
         return outcome
 
+    def _note(self, stacks: list[Taken], made_from: Mapping[str, Any], outcome: Outcome) -> None:
+        """Say what it takes to make the run again from a recording of it."""
+        if stacks:
+            self._record(
+                {
+                    "format": 1,
+                    "scan_ids": [stack.scan_id for stack in stacks],
+                    "made_from": dict(made_from),
+                    "pitches": asdict(self._pitches),
+                    "limits": asdict(self._limits),
+                    "accepted": outcome.accepted,
+                    "hash": outcome.hash,
+                    "message": outcome.message,
+                }
+            )
+
+    # -- verify -----------------------------------------------------------------------------------
+
     def verify(
-        self, gear: Gear, target: str, plate: Plate, sequence: str, in_force: Calibration
-    ) -> VerifyOutcome:
-        """Check the calibration in force on plate or flat, where the stage stands.
+        self, gear: Gear, target: str, heights_m: tuple[float, ...], plate: Plate, sequence: str,
+        in_force: InForce,
+    ) -> VerifyOutcome:  # fmt: skip
+        """Check the calibration in force on plate or flat; the stage goes back where it stood.
+
+        Parameters
+        ----------
+        gear : Gear
+            The devices.
+        target : {"plate", "flat"}
+            What lies there.
+        heights_m : tuple of float
+            Stage heights; empty: three among those of the calibration.
+        plate : Plate
+            The plate, where it is one.
+        sequence : str
+            Patterns, both axes.
+        in_force : InForce
+            What is checked; it is not changed.
 
         Raises
         ------
         SlError
             When the check cannot be made.
         """
-        check = check_rig_on(gear.take(sequence), target, plate, in_force.rig)
-        folder = self._store.new_run("verify")
-        bad = not check.rms_m <= self._verify_limit_m
-        message = _verify_message(check, self._verify_limit_m, bad)
-        write_verify_report(folder, check, self._verify_limit_m, message, in_force.hash)
-        return VerifyOutcome(
-            message, True, bad, check.rms_m, self._verify_limit_m, str(folder / PAGE)
+        check_target(target)
+        calibration = in_force.calibration
+        heights_m = heights_m or default_heights(calibration.made_from, gear.where()[2])
+        order = Order("both", heights_m, plate, sequence, least=1)
+
+        def look(taken: Taken, _: Order) -> Check:
+            return check_rig_on(taken, target, plate, calibration.rig)
+
+        checks = Session(gear, order, look, lambda _: None, self._stage_tolerance_m).views()
+        return self._judged(Findings(checks, stage_z_axis(calibration)), calibration.hash)
+
+    def _judged(self, findings: Findings, calibration_hash: str) -> VerifyOutcome:
+        limits = self._verify_limits
+        told = {name: value for name, value in findings.figures.items() if np.isfinite(value)}
+        verdict = judge(told, limits)
+        reasons = f" ({'; '.join(verdict.reasons)})" if verdict.reasons else ""
+        advice = "the calibration in force is good" if verdict.passed else f"recalibrate{reasons}"
+        target, count = findings.checks[0].target, len(findings.checks)
+        message = (
+            f"{told['rms_m'] * 1e6:.3f} um rms on the {target} at {count} "
+            f"height{'s' * (count > 1)} (limit {limits.rms_m * 1e6:g} um): {advice}; "
+            f"{findings.words}"
         )
+        folder = self._store.new_run("verify")
+        write_verify_report(folder, findings, limits, message, not verdict.passed, calibration_hash)
+        return VerifyOutcome(
+            message, True, not verdict.passed, limit_m=limits.rms_m, report=str(folder / PAGE),
+            views=count, z_scale_error=findings.z_scale_error, **findings.figures,
+        )  # fmt: skip
 
 
-def _verify_message(check: Check, limit_m: float, bad: bool) -> str:
-    advice = "recalibrate" if bad else "the calibration in force is good"
-    return (
-        f"{check.rms_m * 1e6:.3f} um rms on the {check.target} (limit {limit_m * 1e6:g} um): "
-        f"{advice}; {check.words}"
-    )
+def _within_travel(gear: Gear, order: Order) -> tuple[Order, dict[str, str]]:
+    """Order without the views aside where the stage cannot move so, and why it cannot."""
+    if not order.travel_m:
+        return order, {}
+    x, y, _ = gear.where()
+    try:
+        for dx, dy, z in order.places:
+            if dx or dy:
+                gear.check((x + dx, y + dy, z))
+    except SlError as error:
+        return replace(order, travel_m=0.0), {"not_square": f"squareness not measured: {error}"}
+    return order, {}
 
 
-def _made_from(order: Order) -> dict[str, Any]:
-    """Everything that a calibration was made from, plain values."""
+def made_from_order(order: Order, kept: Kept | None = None) -> dict[str, Any]:
+    """Everything that a calibration is made from, plain values."""
     return {
         "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "target": order.target,
         "heights_m": order.distinct,
+        "travel_m": order.travel_m,
         "plate": asdict(order.plate),
         "sequence": order.sequence,
         "software": versions(),
+        **({"kept": kept.plain} if kept else {}),
+        **({} if order.plate.tells_its_back else {"plate_side": _NO_SIDE}),
     }
 
 
@@ -235,126 +323,3 @@ def versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             found[name] = "unknown"
     return found
-
-
-def solve(observations: Observations, limits: Limits) -> Solved:
-    """Solve and judge.
-
-    Raises
-    ------
-    CalibrationError
-        When the observations do not determine a rig.
-    """
-    began_s = time.perf_counter()
-    holes = [
-        HoleView(_stage(v), v.plate_xy_m, v.centres_px, v.centres_sigma_px)
-        for v in observations.views
-    ]
-    targets = [TargetView(_stage(v), v.camera_px, v.dmd_px, v.dmd_sigma_px)
-               for v in observations.views]  # fmt: skip
-    camera = Sensor(observations.camera_size, observations.camera_pitch_m)
-    projector = Sensor(observations.dmd_size, observations.dmd_pitch_m)
-    solution = solve_rig(holes, targets, camera, projector, _freedom(observations.made_from))
-    verdict = judge(solution.figures(lit_volume(solution)), limits)
-    return Solved(observations, solution, verdict, limits, time.perf_counter() - began_s)
-
-
-def lit_volume(solution: RigSolution) -> Volume:
-    """Box of the triangulated targets, without the outermost that may be wrong."""
-    joint = solution.joint
-    used = joint.used[joint.problem.groups[1]]
-    data = joint.problem.targets
-    points, _ = triangulate(solution.rig, data.camera_px[used], data.pixels[used])
-    low, high = np.quantile(points, (0.002, 0.998), axis=0)
-    return Volume(
-        (float(low[0]), float(low[1]), float(low[2])),
-        (float(high[0]), float(high[1]), float(high[2])),
-    )
-
-
-def _stage(view: View) -> Any:
-    return np.array([0.0, 0.0, view.height_m])
-
-
-def _freedom(made_from: Mapping[str, Any]) -> Freedom:
-    """What is estimated: with chamfered holes also how far their edges lie below the face."""
-    chamfer_m = float(made_from.get("plate", {}).get("chamfer_m", 0.0))
-    return Freedom(flat=FlatPrior(2 * chamfer_m, 1e-3)) if chamfer_m else Freedom()
-
-
-def conclude(
-    observations: Observations, limits: Limits, folder: Path, tell: Tell = lambda _: None
-) -> Outcome:
-    """Solve, judge, and write calibration and report into a folder.
-
-    Raises
-    ------
-    CalibrationError
-        When the observations do not determine a rig.
-    """
-    try:
-        solved = solve(observations, limits)
-    except CalibrationError as error:
-        raise CalibrationError(f"{error} (observations kept in {folder})") from error
-    count = len(observations.views)
-    tell(Progress("check", count, count, 0.92))
-    calibration = solved.solution.calibration(observations.made_from)
-    save_calibration(folder / CALIBRATION, calibration)
-    tell(Progress("store", count, count, 0.95))
-    write_report(folder, solved, calibration)
-    return _outcome(solved, calibration, folder)
-
-
-def _outcome(solved: Solved, calibration: Calibration, folder: Path) -> Outcome:
-    joint, rig = solved.solution.joint, solved.solution.rig
-    camera_px, projector_px = joint.rms_px(0), joint.rms_px(1)
-    accepted = solved.verdict.passed
-    return Outcome(
-        message=_message(solved),
-        success=accepted,
-        accepted=accepted,
-        camera_rms_px=camera_px,
-        projector_rms_px=projector_px,
-        camera_rms_m=camera_px * metres_per_pixel(rig.camera),
-        projector_rms_m=projector_px * metres_per_pixel(rig.projector),
-        predicted_sigma_m=solved.predicted_sigma_m,
-        left_out_rms_m=solved.left_out_rms_m,
-        views=len(solved.observations.views),
-        holes=int(joint.used[joint.problem.groups[0]].sum()),
-        calibration_file=str(folder / CALIBRATION),
-        report=str(folder / PAGE),
-        hash=calibration.hash,
-        calibration=calibration,
-    )
-
-
-def _message(solved: Solved) -> str:
-    if not solved.verdict.passed:
-        return "not accepted, the calibration in force stays: " + "; ".join(solved.verdict.reasons)
-    figures = solved.verdict.figures
-    return (
-        f"accepted: z known to {figures['point_sigma_m'] * 1e6:.3f} um in the volume (edge noise "
-        f"apart), heights left out are met within {figures['left_out_z_m'] * 1e6:.3f} um"
-    )
-
-
-def solve_stored(source: Path, output: Path, limits: Limits | None = None) -> Outcome:
-    """Solve a stored run's observations again and write the results elsewhere.
-
-    Parameters
-    ----------
-    source : Path
-        Folder of a run, or its ``observations.npz``.
-    output : Path
-        For calibration and report.
-    limits : Limits, optional
-        Acceptance gate.
-
-    Raises
-    ------
-    CalibrationError
-        When there are no observations, or they do not determine a rig.
-    """
-    file = source / OBSERVATIONS if source.is_dir() else source
-    output.mkdir(parents=True, exist_ok=True)
-    return conclude(load_observations(file), limits or Limits(), output)

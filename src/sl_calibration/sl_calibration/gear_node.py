@@ -16,7 +16,7 @@ from sl_interfaces.msg import MatchedFrame, PatternStack
 from sl_interfaces.srv import MoveStage
 from std_srvs.srv import Trigger
 
-from sl_calibration.session import RunCancelled, Taken
+from sl_calibration.session import Place, RunCancelled, Taken, in_words
 from sl_projector.base_node import EVENTS, LARGE, RigNode, next_scan_id
 from sl_projector.errors import CalibrationError, DeviceError, DeviceTimeout, SlError
 from sl_projector.messages import stamp_from_msg
@@ -107,45 +107,45 @@ class RigGear:
 
     # -- stage ----------------------------------------------------------------------------------
 
-    def where(self) -> float:
-        """Height of the stage now, metres."""
-        return self._height(self._ask(0.0, relative=True, check_only=True))
+    def where(self) -> Place:
+        """Where the stage stands now, metres."""
+        return _position(self._ask((0.0, 0.0, 0.0), relative=True, check_only=True).pose)
 
-    def check(self, height_m: float) -> None:
-        """Refuse a height outside the travel."""
+    def check(self, place: Place) -> None:
+        """Refuse a place outside the travel."""
         try:
-            self._ask(height_m, check_only=True)
+            self._ask(place, check_only=True)
         except DeviceError as error:
             raise CalibrationError(
-                f"the stage does not reach {height_m * 1e3:.4f} mm: {error}"
+                f"the stage does not reach {in_words(place)}: {error}"
             ) from error
 
-    def move(self, height_m: float) -> float:
-        """Move in z only, and wait until the stage has told anew that it stands.
+    def move(self, place: Place) -> Place:
+        """Move, and wait until the stage has told anew that it stands.
 
         Exposures are matched with the poses told before and after them; one from before the
         move would make the synchroniser believe that the stage moved meanwhile.
         """
-        reply = self._ask(height_m)
+        reply = self._ask(place)
         settled_ns = stamp_from_msg(reply.pose.header.stamp) + round(self.settle_s * 1e9)
         end_s = time.monotonic() + self.settle_s + _ANSWER_S
         while self._pose_ns < settled_ns:
             if time.monotonic() > end_s:
                 raise DeviceTimeout("stage/pose is silent: is the stage node running?")
             self._pause()
-        return self._height(reply)
+        return _position(reply.pose)
 
     def _on_pose(self, message: Any) -> None:
         self._pose_ns = stamp_from_msg(message.header.stamp)
 
-    def _ask(self, z_m: float, relative: bool = False, check_only: bool = False) -> Any:
+    def _ask(self, place: Place, relative: bool = False, check_only: bool = False) -> Any:
         """Ask the stage node; what it refuses is raised with its reason."""
         if not self._move.wait_for_service(timeout_sec=_DISCOVERY_S):
             raise DeviceError("nobody offers stage/move: is the stage node running?")
-        request = MoveStage.Request(target=Point(z=z_m), relative=relative, check_only=check_only)
-        if not relative:
-            here = self._ask(0.0, relative=True, check_only=True).pose.pose.position
-            request.target.x, request.target.y = here.x, here.y
+        x, y, z = place
+        request = MoveStage.Request(
+            target=Point(x=x, y=y, z=z), relative=relative, check_only=check_only
+        )
         patience_s = _ANSWER_S if check_only else self.move_timeout_s
         reply = self._answer(self._move.call_async(request), patience_s, "stage/move")
         if not reply.success:
@@ -159,10 +159,6 @@ class RigGear:
                 raise DeviceTimeout(f"{service} did not answer within {patience_s:g} s")
             self._pause()
         return future.result()
-
-    @staticmethod
-    def _height(reply: Any) -> float:
-        return float(reply.pose.pose.position.z)
 
     def halt(self) -> None:
         """Stop stage and projector; their answers are of no interest."""
@@ -246,5 +242,10 @@ def _taken(message: Any) -> Taken:
             f"the stack of scan {message.scan_id} has no stage pose; expected one: set the "
             "synchronizer's parameter require_pose"
         )
-    height_m = float(message.stage_pose.pose.position.z)
-    return Taken(stack.take_images(), stack.sequence, height_m)
+    x, y, z = _position(message.stage_pose)
+    return Taken(stack.take_images(), stack.sequence, z, (x, y), int(message.scan_id))
+
+
+def _position(stamped: Any) -> Place:
+    position = stamped.pose.position
+    return float(position.x), float(position.y), float(position.z)

@@ -33,9 +33,15 @@ class LeftOut(NamedTuple):
 
 
 def leave_heights_out(bundle: Bundle) -> tuple[LeftOut, ...]:
-    """Leave out each height in turn; empty for fewer than three heights, which leaves no check."""
+    """Leave out each height in turn; empty for fewer than three heights, which leaves no check.
+
+    Views aside (other x or y) are left out with their height, but not compared: what x and y
+    travel does may be told by them alone.
+    """
     problem = bundle.problem
-    heights = np.concatenate([problem.holes.stage_m[:, 2], problem.targets.stage_m[:, 2]])
+    both = (problem.holes.stage_m, problem.targets.stage_m)
+    heights = np.concatenate([stage_m[:, 2] for stage_m in both])
+    aside = np.concatenate([np.any(stage_m[:, :2], axis=1) for stage_m in both])
     distinct = np.unique(heights)
     if len(distinct) < 3:
         return ()
@@ -50,10 +56,12 @@ def leave_heights_out(bundle: Bundle) -> tuple[LeftOut, ...]:
         rows = np.concatenate([jacobian[kept].reshape(-1, problem.size), by_prior])
         right = np.concatenate([residuals[kept].ravel(), prior])
         size = np.linalg.norm(rows, axis=0)
+        size[size == 0] = 1.0  # x and y travel, where only this height tells of them
         small = triangle(np.column_stack([rows / size, right]))
         step = -np.linalg.lstsq(small[:, :-1], small[:, -1], rcond=None)[0] / size
         state = problem.moved(bundle.state, step)
-        found.append(_compare(bundle, state, bundle.used & (heights == height_m), float(height_m)))
+        here = bundle.used & (heights == height_m) & ~aside
+        found.append(_compare(bundle, state, here, float(height_m)))
     return tuple(found)
 
 

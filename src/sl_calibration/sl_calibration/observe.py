@@ -12,7 +12,8 @@ from sl_calibration.session import Order, Taken
 from sl_calibration.views import View
 from sl_projector.errors import CalibrationError
 from sl_projector.sequence import Pattern, PatternSequence
-from sl_reconstruct.correspondence import correspondences
+from sl_reconstruct.correspondence import Correspondences, correspondences
+from sl_reconstruct.full_scale import full_scale_dn
 
 #: White must differ from black by this part of the full scale in some part of the image.
 MIN_LIGHT = 0.05
@@ -20,10 +21,13 @@ MIN_LIGHT = 0.05
 MIN_LIT_PART = 0.02
 #: Fewer targets than this in a view do not carry a projector's calibration.
 MIN_TARGETS = 30
+_NO_TARGETS = Correspondences(*np.empty((3, 0, 2)))
 
 
 def observe(taken: Taken, order: Order) -> View:
     """Measure the plate in one stack.
+
+    Without ``order.patterns`` only the holes are looked for, and the view has no targets.
 
     Raises
     ------
@@ -32,20 +36,25 @@ def observe(taken: Taken, order: Order) -> View:
         projector's patterns are not seen on it.
     """
     check_light(taken.images, taken.sequence)
-    full_dn = float(np.iinfo(taken.images.dtype).max)
+    full_dn = full_scale_dn(taken.images)
     holes = find_plate(white_image(taken.images, taken.sequence), order.plate, full_dn)
-    targets = correspondences(taken.images, taken.sequence)
-    if len(targets) < MIN_TARGETS:
-        raise CalibrationError(
-            f"the projector's coordinates were decoded at {len(targets)} places; expected at least "
-            f"{MIN_TARGETS}: is the plate in focus and evenly lit, and the exposure right?"
-        )
+    targets = _targets(taken) if order.patterns else _NO_TARGETS
     good = holes.good
     return View(
         taken.height_m,
         holes.ids[good], holes.plate_xy_m[good], holes.centres_px[good], holes.sigma_px[good],
-        targets.camera_px, targets.dmd_px, targets.sigma_px, targets.edge_sigma_px,
+        targets.camera_px, targets.dmd_px, targets.sigma_px, targets.edge_sigma_px, taken.xy_m,
     )  # fmt: skip
+
+
+def _targets(taken: Taken) -> Correspondences:
+    found = correspondences(taken.images, taken.sequence)
+    if len(found) < MIN_TARGETS:
+        raise CalibrationError(
+            f"the projector's coordinates were decoded at {len(found)} places; expected at least "
+            f"{MIN_TARGETS}: is the plate in focus and evenly lit, and the exposure right?"
+        )
+    return found
 
 
 def white_image(stack: NDArray[Any], sequence: PatternSequence) -> NDArray[np.float32]:
@@ -98,7 +107,7 @@ def check_light(stack: NDArray[Any], sequence: PatternSequence) -> None:
     """
     few = stack[:, ::8, ::8]
     light = few.max(axis=0).astype(np.float64) - few.min(axis=0)
-    full = float(np.iinfo(stack.dtype).max)
+    full = full_scale_dn(stack)
     found = float(np.quantile(light, 1.0 - MIN_LIT_PART))
     if found < MIN_LIGHT * full:
         raise CalibrationError(

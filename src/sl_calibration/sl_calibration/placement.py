@@ -125,6 +125,13 @@ def place(plate: Plate, found: FoundLattice) -> Placement:
             f"the plate is turned over: its mark lies where only the back shows it; "
             f"expected the front, with the mark at hole {plate.origin_id}"
         )
+    if plate.origin_diameter_m and not found.marks.any():
+        raise CalibrationError(
+            f"none of {len(found.ij)} holes has the size of the origin mark; expected one of "
+            f"{plate.origin_diameter_m * 1e3:g} mm among those of {plate.diameter_m * 1e3:g} mm, "
+            f"hole {plate.origin_id}: is it covered or out of view? (for a plate without a mark, "
+            "give 0 as its diameter)"
+        )
     level = [o for o in options if not o.mirrored and o.unexplained == front]
     return _upright(found, level, plate.origin_diameter_m is not None)
 

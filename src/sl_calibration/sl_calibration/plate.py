@@ -45,10 +45,12 @@ class Plate:
     dark_holes : bool
         True for dark holes in a bright plate, False for bright dots on a dark one.
     origin_diameter_m : float, optional
-        Diameter of the one hole that marks the origin; None where there is no mark.
+        Diameter of the one hole that marks the origin; None where there is no mark: a plate turned
+        over is then not noticed.
     origin_id : tuple of int
-        (column, row) of the mark. A corner of a plate with as many columns as rows lies on a
-        diagonal of symmetry: such a plate turned over cannot be told from one that is not.
+        (column, row) of the mark. On a plate with as many columns as rows it must not lie on a
+        diagonal (so not in a corner), and never on a middle line: such a plate turned over looks
+        as it did before.
     chamfer_m : float
         Width and depth of a 45 degree chamfer around each hole, 0 for none. The holes' edges then
         lie that much below the plate's face.
@@ -94,6 +96,13 @@ class Plate:
             )
 
     @property
+    def tells_its_back(self) -> bool:
+        """Whether the mark shows a plate that is turned over."""
+        column, row = (2 * np.array(self.origin_id) - (self.columns - 1, self.rows - 1)).tolist()
+        diagonal = self.columns == self.rows and abs(column) == abs(row)
+        return self.origin_diameter_m is not None and not (diagonal or 0 in (column, row))
+
+    @property
     def hole_count(self) -> int:
         """Holes of the whole plate."""
         return self.columns * self.rows
@@ -108,6 +117,10 @@ class Plate:
         marked = np.all(np.asarray(ids) == self.origin_id, axis=-1)
         origin = self.origin_diameter_m or self.diameter_m
         return np.where(marked, origin, self.diameter_m) / 2
+
+
+#: The paper's plate with a mark that shows its face: what is assumed where nothing else is said.
+DEFAULT_PLATE = Plate(origin_diameter_m=0.6e-3, origin_id=(1, 0))
 
 
 @dataclass(frozen=True)

@@ -6,22 +6,25 @@ import base64
 import html
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sl_calibration.report_pictures import off_plane, pictures, png
+from sl_calibration.report_pictures import camera_pictures, pictures
 from sl_calibration.solution import metres_per_pixel
-from sl_calibration.store import PAGE, REPORT
-from sl_calibration.verify import Check
+from sl_calibration.store import CAMERA_PAGE, CAMERA_REPORT, PAGE, REPORT
 from sl_projector.documents import write_text
 from sl_reconstruct.calibration_file import Calibration
 from sl_reconstruct.rig import Device, Division
 
 if TYPE_CHECKING:
-    from sl_calibration.calibrator import Solved
+    from sl_calibration.bundle import Bundle
+    from sl_calibration.solving import Solved, SolvedCamera
+
+Array = NDArray[np.float64]
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2em auto; max-width: 68em; color: #222;
@@ -51,6 +54,7 @@ FIGURES: Mapping[str, tuple[str, float, str]] = {
     "stage_scale_error": ("Stage's z scale off by", 1e6, "ppm"),
     "stage_lean_rad": ("Stage's z travel against the plate's normal", math.degrees(1.0), "°"),
     "uncovered_part": ("Camera image far from any hole", 100.0, "%"),
+    "kept_lens_sigmas": ("Kept lens off the one that this run finds", 1.0, "sigma"),
 }
 
 
@@ -59,6 +63,19 @@ def write_report(folder: Path, solved: Solved, calibration: Calibration) -> None
     content = report_content(solved, calibration)
     write_json(folder / REPORT, content)
     write_text(folder / PAGE, _page(solved, content))
+
+
+def write_camera_report(folder: Path, solved: SolvedCamera) -> None:
+    """Write ``camera_report.json`` and ``camera_report.html`` of a camera alone."""
+    content = common_content(solved)
+    write_json(folder / CAMERA_REPORT, content)
+    title = f"Calibration of the camera, {content['made_from'].get('date', 'unknown date')}"
+    parts = [
+        *_head(title, content),
+        *(picture(caption, image) for caption, image in camera_pictures(solved)),
+        table("Made from", ("", ""), _origin_rows(content)),
+    ]
+    write_text(folder / CAMERA_PAGE, page(title, parts))
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -79,36 +96,40 @@ def _plain(value: Any) -> Any:
 
 def report_content(solved: Solved, calibration: Calibration) -> dict[str, Any]:
     """Everything that the report says, plain values."""
-    solution, verdict = solved.solution, solved.verdict
-    joint = solution.joint
+    return {
+        **common_content(solved),
+        "predicted_sigma_m": solved.predicted_sigma_m,
+        "edge_sigma_px": solved.edge_noise.camera_u_px,
+        "hash": calibration.hash,
+    }
+
+
+def common_content(solved: Solved | SolvedCamera) -> dict[str, Any]:
+    """What is said of a rig and of a camera alone."""
+    bundle, verdict = solved.bundle, solved.verdict
+    devices = {name: device_content(solved, i) for i, name in enumerate(solved.names)}
     return {
         "format": 1,
         "accepted": verdict.passed,
         "reasons": list(verdict.reasons),
         "figures": dict(verdict.figures),
         "limits": dict(vars(solved.limits)),
-        "predicted_sigma_m": solved.predicted_sigma_m,
-        "edge_sigma_px": solved.edge_noise.camera_u_px,
-        "camera": device_content(solved, 0),
-        "projector": device_content(solved, 1),
-        "stage": {name: value.tolist() for name, value in vars(joint.stage).items()},
-        "chi2": joint.chi2,
-        "degrees_of_freedom": joint.dof,
-        "sigma_scales": joint.scales,
+        **devices,
+        "stage": {name: value.tolist() for name, value in vars(bundle.stage).items()},
+        "chi2": bundle.chi2,
+        "degrees_of_freedom": bundle.dof,
+        "sigma_scales": bundle.scales,
         "heights": _heights(solved),
-        "hash": calibration.hash,
         "solving_s": solved.seconds,
         "made_from": dict(solved.observations.made_from),
     }
 
 
-def device_content(solved: Solved, index: int) -> dict[str, Any]:
+def device_content(solved: Solved | SolvedCamera, index: int) -> dict[str, Any]:
     """One device with its sigmas, and the paper's own solution of it."""
-    name = ("camera", "projector")[index]
-    joint = solved.solution.joint
+    joint, search = solved.bundle, solved.searches[index]
     device: Device = joint.state.devices[index]
-    search = (solved.solution.camera, solved.solution.projector)[index].search
-    prefix = f"{name}."
+    prefix = f"{solved.names[index]}."
     sigmas = {k.removeprefix(prefix): v for k, v in joint.sigmas.items() if k.startswith(prefix)}
     kappa = device.lens.kappa if isinstance(device.lens, Division) else math.nan
     return {
@@ -134,24 +155,28 @@ def device_content(solved: Solved, index: int) -> dict[str, Any]:
     }
 
 
-def _heights(solved: Solved) -> list[dict[str, Any]]:
-    """Residuals of each height, and its error when it is left out."""
-    joint = solved.solution.joint
-    left = {check.height_m: check for check in solved.solution.left_out}
+def _heights(solved: Solved | SolvedCamera) -> list[dict[str, Any]]:
+    """Residuals of each view, and its error when its height is left out."""
+    left_out = getattr(solved.solution, "left_out", ())
+    left = {check.height_m: check.z_rms_m for check in left_out}
     rows = []
-    for view in solved.observations.views:
-        row: dict[str, Any] = {"height_m": view.height_m}
-        for index, what in enumerate(("hole", "target")):
-            data = joint.problem.holes if index == 0 else joint.problem.targets
-            used = joint.used[joint.problem.groups[index]]
-            here = data.stage_m[used, 2] == view.height_m
-            residuals = joint.residuals_of(index)[here]
-            row[f"{what}s"] = int(here.sum())
-            row[f"{what}_rms_px"] = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
-        check = left.get(view.height_m)
-        row["left_out_z_rms_m"] = check.z_rms_m if check else math.nan
+    for stage_m in solved.observations.stage_m:
+        row: dict[str, Any] = {"height_m": float(stage_m[2]), "aside_m": stage_m[:2].tolist()}
+        for index, what in enumerate(("hole", "target")[: len(solved.names)]):
+            row |= _view_residuals(solved.bundle, index, what, stage_m)
+        aside = bool(stage_m[:2].any())
+        row["left_out_z_rms_m"] = math.nan if aside else left.get(stage_m[2], math.nan)
         rows.append(row)
     return rows
+
+
+def _view_residuals(bundle: Bundle, index: int, what: str, stage_m: Array) -> dict[str, Any]:
+    data = bundle.problem.holes if index == 0 else bundle.problem.targets
+    used = bundle.used[bundle.problem.groups[index]]
+    here = np.all(data.stage_m[used] == stage_m, axis=1)
+    residuals = bundle.residuals_of(index)[here]
+    rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))) if here.any() else math.nan
+    return {f"{what}s": int(here.sum()), f"{what}_rms_px": rms}
 
 
 # -- the page -------------------------------------------------------------------------------------
@@ -159,22 +184,29 @@ def _heights(solved: Solved) -> list[dict[str, Any]]:
 
 def _page(solved: Solved, content: Mapping[str, Any]) -> str:
     title = f"Calibration of {content['made_from'].get('date', 'unknown date')}"
-    parts = [f"<h1>{_text(title)}</h1>", _banner(content["accepted"], content["reasons"])]
-    parts += [
-        _table("Verdict", ("Figure", "Found", "Limit"), _figure_rows(content)),
-        _table("Table 1: calibrated parameters, ± 1 sigma",
+    parts = _head(title, content)
+    parts += [picture(caption, image) for caption, image in pictures(solved)]
+    parts.append(table("Made from", ("", ""), _origin_rows(content)))
+    return page(title, parts)
+
+
+def _head(title: str, content: Mapping[str, Any]) -> list[str]:
+    """Verdict and tables."""
+    return [
+        f"<h1>{_text(title)}</h1>",
+        _banner(content["accepted"], content["reasons"]),
+        table("Verdict", ("Figure", "Found", "Limit"), _figure_rows(content)),
+        table("Table 1: calibrated parameters, ± 1 sigma",
                ("Parameter", "Projection device", "Camera", "Paper: projection device, camera"),
                table_1(content)),
-        _table("The paper's search of the image centre: cost J", *_search_rows(content)),
-        _table("Stage", ("Quantity", "Value"), _stage_rows(content["stage"])),
-        _table("Heights", *_height_rows(content["heights"])),
+        table("The paper's search of the image centre: cost J", *_search_rows(content)),
+        table("Stage", ("Quantity", "Value"), _stage_rows(content["stage"])),
+        table("Views", *_height_rows(content["heights"])),
     ]  # fmt: skip
-    parts += [_picture(caption, image) for caption, image in pictures(solved)]
-    parts.append(_table("Made from", ("", ""), _origin_rows(content)))
-    return _document(title, parts)
 
 
-def _document(title: str, parts: Sequence[str]) -> str:
+def page(title: str, parts: Sequence[str]) -> str:
+    """Return a whole page that needs nothing else."""
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{_text(title)}'
         f"</title><style>{_STYLE}</style></head><body>\n" + "\n".join(parts) + "\n</body></html>\n"
@@ -183,16 +215,23 @@ def _document(title: str, parts: Sequence[str]) -> str:
 
 def _banner(accepted: bool, reasons: Sequence[str]) -> str:
     if accepted:
-        return '<p class="verdict good">Accepted: every figure is within its limit</p>'
-    return f'<p class="verdict bad">Not accepted: {_text("; ".join(reasons))}</p>'
+        return banner(True, "Accepted: every figure is within its limit")
+    return banner(False, f"Not accepted: {'; '.join(reasons)}")
+
+
+def banner(good: bool, text: str) -> str:
+    """Return the verdict in its colour."""
+    return f'<p class="verdict {"good" if good else "bad"}">{_text(text)}</p>'
 
 
 def _figure_rows(content: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name, (label, factor, unit) in FIGURES.items():
         if name in content["figures"]:
             found, limit = (content[kind][name] * factor for kind in ("figures", "limits"))
             rows.append((label, f"{found:.4g} {unit}", f"{limit:.4g} {unit}"))
+    if "predicted_sigma_m" not in content:
+        return rows
     sigma = content["predicted_sigma_m"] * 1e6
     noise = content["edge_sigma_px"]
     return [
@@ -206,27 +245,33 @@ def _figure_rows(content: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def table_1(content: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Rows of the paper's Table 1 for this rig: parameter, projector, camera, the paper's."""
-    both = [content["projector"], content["camera"]]
-    cells: dict[str, list[str]] = {
-        "Rotation matrix R": [_rotation_cell(d) for d in both],
-        "Translation vector T, mm": [_translation_cell(d) for d in both],
-        "Effective focal length f, mm": [
-            _pm(d["focal_length_m"] * 1e3, d["sigma"]["focal_length_px"] * d["pixel_pitch_m"] * 1e3)
-            for d in both
-        ],
-        "Effective focal length f, px": [
-            _pm(d["focal_length_px"], d["sigma"]["focal_length_px"]) for d in both
-        ],
-        "Distortion factor kappa, px^-2": [_pm(d["kappa"], d["sigma"]["kappa"]) for d in both],
-        "Image centre C, px": [_centre_cell(d) for d in both],
-        "Residual on the part, µm rms": [f"{d['rms_m'] * 1e6:.4f}" for d in both],
+    """Rows of the paper's Table 1 for this rig: parameter, projector, camera, the paper's.
+
+    The cells of a device that was not calibrated are empty.
+    """
+    cells: dict[str, Callable[[Mapping[str, Any]], str]] = {
+        "Rotation matrix R": _rotation_cell,
+        "Translation vector T, mm": _translation_cell,
+        "Effective focal length f, mm": _focal_cell,
+        "Effective focal length f, px": lambda d: _pm(
+            d["focal_length_px"], d["sigma"]["focal_length_px"]
+        ),
+        "Distortion factor kappa, px^-2": lambda d: _pm(d["kappa"], d["sigma"]["kappa"]),
+        "Image centre C, px": _centre_cell,
+        "Residual on the part, µm rms": lambda d: f"{d['rms_m'] * 1e6:.4f}",
     }
     paper = {**PAPER_TABLE_1, "Residual on the part, µm rms": ("15", "10")}
+    devices = [content.get("projector"), content.get("camera")]
     return [
-        (name, *values, ", ".join(paper[name]) if name in paper else "")
-        for name, values in cells.items()
-    ]
+        (name, *(cell(d) if d else "" for d in devices),
+         ", ".join(paper[name]) if name in paper else "")
+        for name, cell in cells.items()
+    ]  # fmt: skip
+
+
+def _focal_cell(device: Mapping[str, Any]) -> str:
+    sigma_m = device["sigma"]["focal_length_px"] * device["pixel_pitch_m"]
+    return _pm(device["focal_length_m"] * 1e3, sigma_m * 1e3)
 
 
 def _pm(value: float, sigma: float) -> str:
@@ -266,6 +311,8 @@ def _search_rows(content: Mapping[str, Any]) -> tuple[tuple[str, ...], list[tupl
             "Centre found, px", "f, px", "Linear steps")  # fmt: skip
     rows: list[tuple[str, ...]] = []
     for name in ("camera", "projector"):
+        if name not in content:
+            continue
         s = content[name]["paper_search"]
         u, v = s["image_centre_px"]
         rows.append(
@@ -288,24 +335,34 @@ def _stage_rows(stage: Mapping[str, Any]) -> list[tuple[str, ...]]:
         if math.isfinite(lean):
             text = f"{math.degrees(lean):+.5f}° ± {math.degrees(sigma):.5f}°"
             rows.append((f"z travel leans from the plate's normal towards {axis}", text))
+    angles = zip(("x to y", "x to z", "y to z"), stage["squareness_rad"],
+                 stage["squareness_sigma_rad"], strict=True)  # fmt: skip
+    for axes, angle, sigma in angles:
+        if math.isfinite(angle):
+            text = f"{math.degrees(angle):+.5f}° ± {math.degrees(sigma):.5f}°"
+            rows.append((f"stage out of square, {axes} (90° less their angle)", text))
     return rows
 
 
 def _height_rows(
     heights: Sequence[Mapping[str, Any]],
 ) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    head = ("Stage height, mm", "Holes", "rms, camera px", "Targets", "rms, DMD px",
-            "z when left out, µm rms")  # fmt: skip
-    rows: list[tuple[str, ...]] = [
-        (f"{h['height_m'] * 1e3:.4f}", str(h["holes"]), f"{h['hole_rms_px']:.4f}",
-         str(h["targets"]), f"{h['target_rms_px']:.4f}", f"{h['left_out_z_rms_m'] * 1e6:.4f}")
-        for h in heights
-    ]  # fmt: skip
-    return head, rows
+    head = ("Stage height, mm", "Aside, x and y, mm", "Holes", "rms, camera px", "Targets",
+            "rms, DMD px", "z when left out, µm rms")  # fmt: skip
+    rows: list[tuple[str, ...]] = []
+    for h in heights:
+        x, y = (f"{a * 1e3:g}" for a in h["aside_m"])
+        targets = h.get("targets", 0), h.get("target_rms_px", math.nan)
+        rows.append(
+            (f"{h['height_m'] * 1e3:.4f}", f"{x}, {y}", str(h["holes"]),
+             f"{h['hole_rms_px']:.4f}", str(targets[0]), f"{targets[1]:.4f}",
+             f"{h['left_out_z_rms_m'] * 1e6:.4f}")
+        )  # fmt: skip
+    return head, [tuple("" if cell == "nan" else cell for cell in row) for row in rows]
 
 
 def _origin_rows(content: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    rows: list[tuple[str, ...]] = [("calibration hash", str(content["hash"])),
+    rows: list[tuple[str, ...]] = [("calibration hash", str(content.get("hash", "none"))),
             ("solving", f"{content['solving_s']:.2f} s")]  # fmt: skip
     return rows + [
         (str(name), json.dumps(_plain(value), ensure_ascii=False))
@@ -313,7 +370,8 @@ def _origin_rows(content: Mapping[str, Any]) -> list[tuple[str, ...]]:
     ]
 
 
-def _table(heading: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(heading: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table under its heading; cells are plain text."""
     top = "".join(f"<th>{_text(name)}</th>" for name in head)
     body = "".join(
         "<tr>" + "".join(f"<td>{_cell(cell)}</td>" for cell in row) + "</tr>" for row in rows
@@ -325,7 +383,8 @@ def _cell(text: str) -> str:
     return f"<pre>{_text(text)}</pre>" if "\n" in text else _text(text)
 
 
-def _picture(caption: str, image: bytes) -> str:
+def picture(caption: str, image: bytes) -> str:
+    """Return a PNG, contained in the page, under its caption."""
     return (
         f'<h2>{_text(caption)}</h2><img alt="{_text(caption)}" '
         f'src="data:image/png;base64,{base64.b64encode(image).decode()}">'
@@ -334,26 +393,3 @@ def _picture(caption: str, image: bytes) -> str:
 
 def _text(value: str) -> str:
     return html.escape(value, quote=True)
-
-
-# -- a check of the calibration in force ----------------------------------------------------------
-
-
-def write_verify_report(
-    folder: Path, check: Check, limit_m: float, message: str, calibration_hash: str
-) -> None:
-    """Write the report of a check: JSON and a page."""
-    names = ("target", "plane_rms_m", "gap_rms_m", "lattice_rms_m", "scale_error", "points")
-    content = {name: getattr(check, name) for name in names}
-    content |= {"rms_m": check.rms_m, "limit_m": limit_m, "message": message,
-                "calibration_hash": calibration_hash}  # fmt: skip
-    write_json(folder / REPORT, content)
-    good = check.rms_m <= limit_m
-    title = f"Check of the calibration in force on the {check.target}"
-    banner = f'<p class="verdict {"good" if good else "bad"}">{_text(message)}</p>'
-    rows = [(name.replace("_", " "), f"{value}") for name, value in content.items()]
-    picture = _picture(
-        "Points off the best plane", png(off_plane(check.points_m, check.off_plane_m))
-    )
-    parts = [f"<h1>{_text(title)}</h1>", banner, _table("Figures", ("", ""), rows), picture]
-    write_text(folder / PAGE, _document(title, parts))

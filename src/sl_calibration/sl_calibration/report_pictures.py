@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from sl_calibration.solution import metres_per_pixel
 from sl_calibration.uncertainty import EdgeNoise, sigma_map
 
 if TYPE_CHECKING:
-    from sl_calibration.calibrator import Solved
+    from sl_calibration.solving import Solved, SolvedCamera
 
 Array = NDArray[np.float64]
 
@@ -51,11 +51,29 @@ def pictures(solved: Solved) -> Iterator[tuple[str, bytes]]:
         yield caption, png(draw(solved))
 
 
+def camera_pictures(solved: SolvedCamera) -> Iterator[tuple[str, bytes]]:
+    """The same of a camera alone."""
+    made: tuple[tuple[str, Callable[[SolvedCamera], Figure]], ...] = (
+        ("Residuals at each height, on the part (the paper's Fig. 6)", residuals_by_height),
+        ("Residual vectors", residual_vectors),
+        ("Coverage: where holes were measured", coverage),
+    )
+    for caption, draw in made:
+        yield caption, png(draw(solved))
+
+
+def _panels(solved: Solved | SolvedCamera, height: float) -> tuple[Figure, list[Any]]:
+    """Figure with axes for each device."""
+    count = len(solved.names)
+    figure = _figure(5.25 * count, height)
+    return figure, list(figure.subplots(1, count, squeeze=False)[0])
+
+
 class _Group:
     """Holes or targets: where they are in their image, how far off, at which height."""
 
-    def __init__(self, solved: Solved, index: int) -> None:
-        joint = solved.solution.joint
+    def __init__(self, solved: Solved | SolvedCamera, index: int) -> None:
+        joint = solved.bundle
         data = joint.problem.holes if index == 0 else joint.problem.targets
         rows = joint.used[joint.problem.groups[index]]
         device = joint.state.devices[index]
@@ -74,10 +92,10 @@ class _Group:
         return np.asarray(np.hypot(*self.residuals_px.T) * self.metres)
 
 
-def residuals_by_height(solved: Solved) -> Figure:
+def residuals_by_height(solved: Solved | SolvedCamera) -> Figure:
     """Every residual's length over the height, with the rms of each height and the noise floor."""
-    figure = _figure(9.5, 3.6)
-    for i, axes in enumerate(figure.subplots(1, 2)):
+    figure, panels = _panels(solved, 3.6)
+    for i, axes in enumerate(panels):
         group = _Group(solved, i)
         heights = np.unique(group.height_m)
         step = float(np.min(np.diff(heights))) if len(heights) > 1 else 1e-3
@@ -96,10 +114,10 @@ def residuals_by_height(solved: Solved) -> Figure:
     return figure
 
 
-def residual_vectors(solved: Solved) -> Figure:
+def residual_vectors(solved: Solved | SolvedCamera) -> Figure:
     """Residuals as arrows in both images, coloured by height."""
-    figure = _figure(10.5, 4.6)
-    for i, axes in enumerate(figure.subplots(1, 2)):
+    figure, panels = _panels(solved, 4.6)
+    for i, axes in enumerate(panels):
         group = _Group(solved, i)
         few = slice(None, None, 1 + len(group.pixels) // _MOST_ARROWS)
         (u, v), (du, dv) = group.pixels[few].T, group.residuals_px[few].T
@@ -118,14 +136,14 @@ def residual_vectors(solved: Solved) -> Figure:
     return figure
 
 
-def coverage(solved: Solved) -> Figure:
+def coverage(solved: Solved | SolvedCamera) -> Figure:
     """Where both devices were measured, all heights together."""
-    figure = _figure(10.5, 4.3)
-    for i, axes in enumerate(figure.subplots(1, 2)):
+    figure, panels = _panels(solved, 4.3)
+    for i, axes in enumerate(panels):
         group = _Group(solved, i)
         dots = axes.scatter(*group.pixels.T, c=group.height_m * _MM, s=5, cmap="viridis")
         axes.set(title=f"{group.name}: {len(group.pixels):,} points")
-        centre = solved.solution.joint.state.devices[i].centre_px
+        centre = solved.bundle.state.devices[i].centre_px
         axes.plot(*centre, "r+", ms=12, label="image centre C")
         axes.legend(loc="lower right", fontsize=8)
         _image_axes(axes, group.size)
@@ -176,15 +194,18 @@ def left_out(solved: Solved) -> Figure:
     return figure
 
 
-def off_plane(points_m: Array, off_m: Array) -> Figure:
-    """Distances from the best plane over x and y, of a check."""
-    figure = _figure(7, 4.6)
-    axes = figure.subplots()
-    most = float(np.quantile(np.abs(off_m), 0.99)) * _UM
-    dots = axes.scatter(
-        points_m[:, 0] * _MM, points_m[:, 1] * _MM, c=off_m * _UM, s=14, cmap="RdBu",
-        vmin=-most, vmax=most,
-    )  # fmt: skip
-    axes.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", title="off the best plane")
-    figure.colorbar(dots, ax=axes, label="µm")
+def off_planes(layers: Sequence[tuple[float, Array, Array]]) -> Figure:
+    """Distances (N,) from the best plane over x and y (N, 3) at each height, of a check."""
+    figure = _figure(1 + 4.2 * len(layers), 3.8)
+    most = float(np.quantile(np.abs(np.concatenate([off for _, _, off in layers])), 0.99)) * _UM
+    panels = figure.subplots(1, len(layers), squeeze=False)[0]
+    for axes, (height_m, points_m, off_m) in zip(panels, layers, strict=True):
+        dots = axes.scatter(
+            points_m[:, 0] * _MM, points_m[:, 1] * _MM, c=off_m * _UM, s=10, cmap="RdBu",
+            vmin=-most, vmax=most,
+        )  # fmt: skip
+        title = f"off the best plane, stage at {height_m * _MM:.3f} mm"
+        axes.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", title=title)
+        axes.title.set_fontsize(9)
+    figure.colorbar(dots, ax=list(panels), label="µm")
     return figure

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,10 @@ MIN_STEP_M = 20e-6
 MIN_MOTION_PX = 0.1
 
 TARGETS = ("camera", "projector", "both")
+
+#: Position of the stage: x, y, z, metres.
+Place = tuple[float, float, float]
+_SeenT = TypeVar("_SeenT")
 
 
 class RunCancelled(SlError):
@@ -48,22 +52,32 @@ class Order:
         The hole plate on the stage.
     sequence : str
         Patterns, both axes.
+    travel_m : float
+        Two further views, moved so far in x and in y, at the middle height: they tell a plate that
+        leans from a stage that is not square. 0 for none.
+    patterns : bool
+        Whether the projector's coordinates are wanted, or the plate's holes only.
+    least : int
+        So many different heights are needed.
     """
 
     target: str
     heights_m: tuple[float, ...]
     plate: Plate
     sequence: str
+    travel_m: float = 0.0
+    patterns: bool = True
+    least: int = MIN_HEIGHTS
 
     def __post_init__(self) -> None:
         if self.target not in TARGETS:
             raise CalibrationError(f"target={self.target!r}; expected one of {TARGETS}")
         if not all(map(math.isfinite, self.heights_m)):
             raise CalibrationError(f"heights_m={self.heights_m}; expected finite numbers")
-        if len(self.distinct) < MIN_HEIGHTS:
+        if len(self.distinct) < self.least:
             raise CalibrationError(
                 f"{len(self.distinct)} different heights (of {list(self.heights_m)} m); expected "
-                f"at least {MIN_HEIGHTS}, {MIN_STEP_M * 1e6:g} um or more apart: from one height "
+                f"at least {self.least}, {MIN_STEP_M * 1e6:g} um or more apart: from one height "
                 "neither focal length and distance nor the stage can be told apart"
             )
 
@@ -74,6 +88,17 @@ class Order:
         for height_m in sorted(self.heights_m):
             if not found or height_m - found[-1] >= MIN_STEP_M:
                 found.append(height_m)
+        return found
+
+    @property
+    def places(self) -> list[Place]:
+        """Where views are taken, in order: x and y from where the stage stands, z absolute."""
+        heights, travel_m = self.distinct, self.travel_m
+        found = [(0.0, 0.0, height_m) for height_m in heights]
+        if travel_m:
+            middle = len(heights) // 2
+            aside = [(travel_m, 0.0, heights[middle]), (0.0, travel_m, heights[middle])]
+            found[middle + 1 : middle + 1] = aside
         return found
 
 
@@ -89,11 +114,22 @@ class Taken:
         What was projected.
     height_m : float
         Stage z of the stack's pose, metres.
+    xy_m : tuple of float
+        Stage x and y, metres.
+    scan_id : int
+        The stack's number; 0 where it has none.
     """
 
     images: NDArray[Any]
     sequence: PatternSequence
     height_m: float
+    xy_m: tuple[float, float] = (0.0, 0.0)
+    scan_id: int = 0
+
+    @property
+    def place(self) -> Place:
+        """Where the stage stood."""
+        return (*self.xy_m, self.height_m)
 
 
 @dataclass(frozen=True)
@@ -131,16 +167,16 @@ class Gear(Protocol):
     the run is cancelled.
     """
 
-    def where(self) -> float:
-        """Return the stage's height now, metres."""
+    def where(self) -> Place:
+        """Return where the stage stands now."""
         ...
 
-    def check(self, height_m: float) -> None:
-        """Refuse a height outside the stage's travel; nothing moves."""
+    def check(self, place: Place) -> None:
+        """Refuse a place outside the stage's travel; nothing moves."""
         ...
 
-    def move(self, height_m: float) -> float:
-        """Move to a height, wait, and return where the stage says it stands."""
+    def move(self, place: Place) -> Place:
+        """Move to a place, wait, and return where the stage says it stands."""
         ...
 
     def take(self, sequence: str) -> Taken:
@@ -152,7 +188,7 @@ class Gear(Protocol):
         ...
 
 
-class Session:
+class Session(Generic[_SeenT]):
     """Takes the views of one run.
 
     Parameters
@@ -162,26 +198,29 @@ class Session:
     order : Order
         What is asked for.
     observe : callable
-        Makes a `View` of what was taken, or raises why it cannot.
+        Makes what is wanted of what was taken, or raises why it cannot.
     tell : callable
         Called with each change of progress.
     stage_tolerance_m : float
         The stage stands where it was sent within this.
+    compare : callable
+        Called with each view and the one before; raises when they cannot both be right.
     """
 
     def __init__(
         self,
         gear: Gear,
         order: Order,
-        observe: Callable[[Taken, Order], View],
+        observe: Callable[[Taken, Order], _SeenT],
         tell: Tell,
         stage_tolerance_m: float = 5e-6,
+        compare: Callable[[_SeenT, _SeenT], None] = lambda _before, _after: None,
     ) -> None:
         self._gear, self._order = gear, order
-        self._observe, self._tell = observe, tell
+        self._observe, self._compare, self._tell = observe, compare, tell
         self._tolerance_m = stage_tolerance_m
 
-    def views(self) -> tuple[View, ...]:
+    def views(self) -> tuple[_SeenT, ...]:
         """Take all views; afterwards the stage stands where it stood before.
 
         After a cancelled run it stands where it was stopped.
@@ -191,62 +230,68 @@ class Session:
         RunCancelled
             Stage and projector were stopped.
         CalibrationError, DeviceError
-            With the height at which it happened.
+            With the place at which it happened.
         """
-        start_m = self._gear.where()
-        for height_m in self._order.distinct:
-            self._gear.check(height_m)
+        start = self._gear.where()
+        places = [(start[0] + x, start[1] + y, z) for x, y, z in self._order.places]
+        for place in places:
+            self._gear.check(place)
         try:
-            views = self._take_all()
+            views = self._take_all(places)
         except RunCancelled:
             self._gear.halt()
             raise
         except SlError:
             with suppress(SlError):  # the first error is the one to be told
-                self._gear.move(start_m)
+                self._gear.move(start)
             raise
-        self._gear.move(start_m)
+        self._gear.move(start)
         return views
 
-    def _take_all(self) -> tuple[View, ...]:
-        views: list[View] = []
-        heights = self._order.distinct
-        for i, height_m in enumerate(heights):
+    def _take_all(self, places: list[Place]) -> tuple[_SeenT, ...]:
+        views: list[_SeenT] = []
+        for i, place in enumerate(places):
             try:
-                view = self._take(i, height_m)
+                view = self._take(i, place)
                 if views:
-                    check_motion(views[-1], view)
+                    self._compare(views[-1], view)
             except CalibrationError as error:
                 raise CalibrationError(
-                    f"view {i + 1} of {len(heights)}, stage at {height_m * 1e3:.4f} mm: {error}"
+                    f"view {i + 1} of {len(places)}, stage at {in_words(place)}: {error}"
                 ) from error
             views.append(view)
         return tuple(views)
 
-    def _take(self, i: int, height_m: float) -> View:
+    def _take(self, i: int, place: Place) -> _SeenT:
         self._report("home", i)
-        self._check_height(self._gear.move(height_m), height_m)
+        self._check_place(self._gear.move(place), place)
         self._report("planes", i)
         taken = self._gear.take(self._order.sequence)
-        self._check_height(taken.height_m, height_m)
+        self._check_place(taken.place, place)
         self._report("plate", i)
         return self._observe(taken, self._order)
 
-    def _check_height(self, found_m: float, asked_m: float) -> None:
-        if not abs(found_m - asked_m) <= self._tolerance_m:
+    def _check_place(self, found: Place, asked: Place) -> None:
+        if not all(abs(f - a) <= self._tolerance_m for f, a in zip(found, asked, strict=True)):
             raise CalibrationError(
-                f"the stage stands at {found_m * 1e3:.4f} mm but was sent to {asked_m * 1e3:.4f} "
-                f"mm; expected it within {self._tolerance_m * 1e6:g} um: it does not move as told"
+                f"the stage stands at {in_words(found)} but was sent to {in_words(asked)}; "
+                f"expected it within {self._tolerance_m * 1e6:g} um: it does not move as told"
             )
 
     def _report(self, stage: str, i: int) -> None:
-        views = len(self._order.distinct)
+        views = len(self._order.places)
         fraction = _TAKING * (i + _BEGINS[stage]) / views
         self._tell(Progress(stage, i + 1, views, fraction))
 
 
+def in_words(place: Place) -> str:
+    """Height of a place; x and y as well where they are not zero."""
+    x, y, z = (f"{axis * 1e3:.4f}" for axis in place)
+    return f"{z} mm" if max(map(abs, place[:2])) < MIN_STEP_M else f"({x}, {y}, {z}) mm"
+
+
 def check_motion(before: View, after: View) -> None:
-    """Refuse two views at different heights that show the plate in the same place.
+    """Refuse two views at different places that show the plate in the same one.
 
     Raises
     ------
@@ -260,10 +305,11 @@ def check_motion(before: View, after: View) -> None:
             "no hole of the view before is seen any more; expected the same plate at every height"
         )
     a, b = np.array(pairs).T
+    moved_m = float(np.linalg.norm(np.subtract(after.place, before.place)))
     moved_px = np.linalg.norm(after.centres_px[b] - before.centres_px[a], axis=1)
     if float(np.median(moved_px)) < MIN_MOTION_PX:
         raise CalibrationError(
-            f"the stage says that it moved by {(after.height_m - before.height_m) * 1e3:.4f} mm "
-            f"but the holes' images moved by {float(np.median(moved_px)):.3f} px; expected at "
+            f"the stage says that it moved by {moved_m * 1e3:.4f} mm but "
+            f" the holes' images moved by {float(np.median(moved_px)):.3f} px; expected at "
             f"least {MIN_MOTION_PX} px: the stage, or the plate on it, does not move"
         )

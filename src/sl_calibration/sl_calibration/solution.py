@@ -88,6 +88,8 @@ class RigSolution:
             "projector_rms_px": joint.rms_px(1),
             "chi2": joint.chi2,
             "degrees_of_freedom": joint.dof,
+            # What a check of z against the stage needs: where a metre of its z goes.
+            "stage_z_axis": [float(v) for v in joint.state.axes[:, 2]],
         }
         return Calibration(self.rig, joint.covariance, residuals, made_from or {})
 

@@ -1,7 +1,8 @@
 """The folder of calibrations: one folder per run, and which of them is in force.
 
 A run that was rejected is kept beside the others, for who wants to know why; only an accepted
-one is ever named by the pointer file ``current``.
+one is ever named by the pointer file ``current``. The file ``camera`` names the run of a camera
+that was calibrated alone, until a rig is put in force.
 """
 
 from __future__ import annotations
@@ -16,7 +17,10 @@ from sl_projector.errors import CalibrationError
 
 CALIBRATION, OBSERVATIONS = "calibration.yaml", "observations.npz"
 REPORT, PAGE = "report.json", "report.html"
+#: Of a camera that was calibrated without a projector.
+CAMERA, CAMERA_REPORT, CAMERA_PAGE = "camera.yaml", "camera_report.json", "camera_report.html"
 _POINTER = "current"
+_CAMERA_POINTER = "camera"
 
 
 def default_directory() -> Path:
@@ -63,6 +67,19 @@ class Store:
             When it is no run of this folder with a calibration.
         """
         write_text(self.directory / _POINTER, self._checked(run.name).parent.name + "\n")
+        (self.directory / _CAMERA_POINTER).unlink(missing_ok=True)
+
+    def put_camera(self, run: Path) -> None:
+        """Name the run of a camera that waits for its projector; errors as `put_in_force`."""
+        self._checked(run.name, CAMERA)
+        write_text(self.directory / _CAMERA_POINTER, run.name + "\n")
+
+    def camera(self) -> Path | None:
+        """Return the file of the camera that waits for its projector; errors as `current`."""
+        pointer = self.directory / _CAMERA_POINTER
+        if not pointer.exists():
+            return None
+        return self._checked(read_text(pointer, CalibrationError).strip(), CAMERA)
 
     def current(self) -> Path | None:
         """Return the calibration file in force, None when there never was one.
@@ -82,11 +99,11 @@ class Store:
         pointer = self.directory / _POINTER
         return pointer.stat().st_mtime_ns if pointer.exists() else 0
 
-    def _checked(self, name: str) -> Path:
+    def _checked(self, name: str, kind: str = CALIBRATION) -> Path:
         """Calibration of a run; a name never leads out of the directory."""
-        file = self.directory / name / CALIBRATION
+        file = self.directory / name / kind
         if not name or Path(name).name != name or name in (".", "..") or not file.is_file():
             raise CalibrationError(
-                f"{self.directory} has no run {name!r} with a {CALIBRATION}; expected one"
+                f"{self.directory} has no run {name!r} with a {kind}; expected one"
             )
         return file

@@ -23,6 +23,8 @@ from sl_projector.errors import CalibrationError
 Array = NDArray[np.float64]
 
 FORMAT = 1
+#: Views are aside of each other when their x or y differ by this, metres.
+SAME_XY_M = 20e-6
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ class View:
         Their 1-sigma.
     edge_sigma_px : float
         1-sigma of a single edge on this plate in this light, camera pixels.
+    xy_m : tuple of float
+        Stage x and y, as the stage tells them, metres.
     """
 
     height_m: float
@@ -60,6 +64,12 @@ class View:
     dmd_px: Array
     dmd_sigma_px: Array
     edge_sigma_px: float = float("nan")
+    xy_m: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def place(self) -> tuple[float, float, float]:
+        """Where the stage stood, metres."""
+        return (*self.xy_m, self.height_m)
 
 
 @dataclass(frozen=True)
@@ -84,6 +94,17 @@ class Observations:
     camera_pitch_m: float
     dmd_pitch_m: float
     made_from: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def stage_m(self) -> list[Array]:
+        """Stage position (3,) of each view: z as it reads, x and y from where most views stood.
+
+        A stage whose x and y only tremble has not moved in them.
+        """
+        xy = np.array([view.xy_m for view in self.views])
+        aside = xy - np.median(xy, axis=0)
+        aside[np.abs(aside) < SAME_XY_M] = 0.0
+        return [np.array([*a, v.height_m]) for a, v in zip(aside, self.views, strict=True)]
 
     @property
     def holes(self) -> int:
@@ -127,10 +148,10 @@ def load_observations(path: Path) -> Observations:
             about = json.loads(str(file["about"]))
             _check_format(about, path)
             views = [
-                {name: file[f"{name}_{i}"] for name in names} for i in range(int(about["views"]))
+                {n: file[f"{n}_{i}"] for n in names if n != "xy_m" or f"{n}_{i}" in file}
+                for i in range(int(about["views"]))
             ]
-        scalars = ("height_m", "edge_sigma_px")
-        made = [View(**{**v, **{name: float(v[name]) for name in scalars}}) for v in views]
+        made = [_view(values) for values in views]
         return Observations(
             tuple(made), _size(about["camera_size"]), _size(about["dmd_size"]),
             float(about["camera_pitch_m"]), float(about["dmd_pitch_m"]), about["made_from"],
@@ -141,6 +162,13 @@ def load_observations(path: Path) -> Observations:
         raise CalibrationError(
             f"{path} holds no observations ({error}); expected the observations.npz of a run"
         ) from error
+
+
+def _view(values: dict[str, Any]) -> View:
+    """View of its arrays; older files have no x and y."""
+    x, y = values.get("xy_m", (0.0, 0.0))
+    numbers = {name: float(values[name]) for name in ("height_m", "edge_sigma_px")}
+    return View(**{**values, **numbers, "xy_m": (float(x), float(y))})
 
 
 def _check_format(about: Mapping[str, Any], path: Path) -> None:

@@ -147,12 +147,12 @@ def parse_calibration(text: str, source: str = "calibration") -> Calibration:
     version = fields.get("format", a_whole_number)
     if version != FORMAT:
         raise CalibrationError(f"{source} is of format {version}; expected format {FORMAT}")
-    rig = Rig(fields.get("camera", _a_device), fields.get("projector", _a_device))
+    rig = Rig(fields.get("camera", a_device), fields.get("projector", a_device))
     check_rig(rig, source)
     _check_hash(fields.get("hash", a_string, None), rig, source)
     return Calibration(
         rig,
-        fields.get("covariance", _a_covariance, None),
+        fields.get("covariance", a_covariance, None),
         fields.get("residuals", _a_mapping, {}),
         fields.get("made_from", _a_mapping, {}),
     )
@@ -167,7 +167,8 @@ def _check_hash(stored: str | None, rig: Rig, source: str) -> None:
         )
 
 
-def _a_device(value: Any, where: str, error: type[SlError]) -> Device:
+def a_device(value: Any, where: str, error: type[SlError]) -> Device:
+    """Check that a value is a device's section, and return the device."""
     fields = Fields(value, where, error, _DEVICE_KEYS)
     model = fields.get("model", a_string)
     if model not in ("division", "brown_conrady"):
@@ -217,7 +218,8 @@ def a_rotation(value: Any, where: str, error: type[SlError]) -> Array:
     return nearest_rotation(matrix, where, error)
 
 
-def _a_covariance(value: Any, where: str, error: type[SlError]) -> Covariance:
+def a_covariance(value: Any, where: str, error: type[SlError]) -> Covariance:
+    """Check that a value is a covariance with as many rows as names."""
     fields = Fields(value, where, error, ("parameters", "matrix"))
     names = [a_string(name, where, error) for name in fields.get("parameters", a_list)]
     rows = fields.get("matrix", a_list)
@@ -234,7 +236,8 @@ def _a_mapping(value: Any, where: str, error: type[SlError]) -> Mapping[str, Any
     return value
 
 
-def _device_document(device: Device) -> dict[str, Any]:
+def device_document(device: Device) -> dict[str, Any]:
+    """Return a device's section, every number with all its digits."""
     lens = device.lens
     model: dict[str, Any] = (
         {"model": "division", "kappa": _number(lens.kappa)}
@@ -263,7 +266,13 @@ def _numbers(values: Any) -> list[float]:
 
 
 def _rig_document(rig: Rig) -> dict[str, Any]:
-    return {"camera": _device_document(rig.camera), "projector": _device_document(rig.projector)}
+    return {"camera": device_document(rig.camera), "projector": device_document(rig.projector)}
+
+
+def covariance_document(covariance: Covariance) -> dict[str, Any]:
+    """Return the section of a covariance."""
+    matrix = [_numbers(row) for row in covariance.matrix]
+    return {"parameters": list(covariance.parameters), "matrix": matrix}
 
 
 def dump_calibration(calibration: Calibration | Rig) -> str:
@@ -272,10 +281,7 @@ def dump_calibration(calibration: Calibration | Rig) -> str:
         calibration = Calibration(calibration)
     document: dict[str, Any] = {"format": FORMAT, **_rig_document(calibration.rig)}
     if calibration.covariance is not None:
-        document["covariance"] = {
-            "parameters": list(calibration.covariance.parameters),
-            "matrix": [_numbers(row) for row in calibration.covariance.matrix],
-        }
+        document["covariance"] = covariance_document(calibration.covariance)
     for key in ("residuals", "made_from"):
         if content := getattr(calibration, key):
             document[key] = dict(content)
