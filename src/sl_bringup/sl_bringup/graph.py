@@ -134,13 +134,15 @@ class Graph:
             Give up after so long; 0: never.
         """
         wanted = ("--nodes", *NODES, "--timeout", f"{timeout_s}")
+        if await self.run_client("sl_bringup.ready_node", *wanted) != 0:
+            return False
         if self._options.bench:
             try:
                 await asyncio.wait_for(self._bench_ready.wait(), timeout_s or None)
             except TimeoutError:
                 self._tell("graph not ready: the bench does not answer")
                 return False
-        return await self.run_client("sl_bringup.ready_node", *wanted) == 0
+        return True
 
     async def run_client(self, module: str, *arguments: str) -> int:
         """Run a ROS client of this graph to its end, return its exit status."""

@@ -47,6 +47,10 @@ ALLOCATOR = {
     "MALLOC_TOP_PAD_": str(4 * MIB),
 }
 
+#: Every process announces itself so often, not each 3 s: a newcomer that missed the first
+#: announcements, as on a busy machine it does, would wait for the next (``docs/transport.md``).
+ANNOUNCEMENT_S = 1
+
 _PROFILE = """<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
   <transport_descriptors>
@@ -64,6 +68,9 @@ _PROFILE = """<?xml version="1.0" encoding="UTF-8"?>
       <transport_id>sl_shm</transport_id><transport_id>sl_udp</transport_id>
     </userTransports>
     <useBuiltinTransports>false</useBuiltinTransports>
+    <builtin><discovery_config>
+      <leaseAnnouncement><sec>{announcement}</sec></leaseAnnouncement>
+    </discovery_config></builtin>
   </rtps></participant>
 </profiles></dds>
 """
@@ -124,6 +131,7 @@ def profile_xml(segment: int, network: bool) -> str:
     return _PROFILE.format(
         segment=segment,
         piece=min(MAX_PIECE_BYTES, segment // 2),
+        announcement=ANNOUNCEMENT_S,
         whitelist="" if network else _LOOPBACK,
     )
 
