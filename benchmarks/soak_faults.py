@@ -49,7 +49,7 @@ ANSWER_S = 180.0
 #: A cloud is wrong when more than this part of its points is further from the clean cloud than
 #: 6 of the stated standard deviations of the difference and 2 um (white noise: 2e-9).
 OUTLIER_PART, SIGMAS, SLACK_M = 1e-4, 6.0, 2e-6
-#: ... or when it lacks more than this part of the clean cloud's points.
+#: A cloud is thin when it lacks more than this part of the clean cloud's points.
 MISSING_PART = 0.02
 #: So far from where it stood for the clean clouds the stage may stand, after what it suffered.
 REPEATABILITY_M = 10e-6
@@ -269,9 +269,13 @@ def wrong(cloud: Any, clean: Any, offset_m: float) -> str:
     far = int((np.abs(cloud["z"][both] - clean["z"][both]) > limit_m).sum())
     if far > OUTLIER_PART * both.sum():
         return f"{far} of {both.sum()} points are elsewhere"
-    if here.sum() < (1 - MISSING_PART) * there.sum():
-        return f"{here.sum()} points, the clean cloud has {there.sum()}"
     return ""
+
+
+def thin(cloud: Any, clean: Any) -> bool:
+    """Whether points are missing: refused one by one where a saturated frame left no doubt."""
+    here, there = (int(np.isfinite(c["z"]).sum()) for c in (cloud, clean))
+    return here < (1 - MISSING_PART) * there
 
 
 # -- the soak -----------------------------------------------------------------------------------
@@ -382,6 +386,7 @@ class Soak:
         clouds, self._client.clouds[:] = list(self._client.clouds), []
         for stamp_ns, cloud in clouds:
             sequence = next(s for began_ns, s in reversed(self._sequences) if began_ns <= stamp_ns)
+            book["thin"] += thin(cloud, self._clean[sequence])
             if fault := wrong(cloud, self._clean[sequence], offset_m):
                 self._defect(index, what, f"WRONG CLOUD: {fault} ({offset_m * 1e6:.1f} um off)")
                 if self._keep:
@@ -526,6 +531,8 @@ def soak(arguments: argparse.Namespace, options: GraphOptions) -> dict[str, Any]
     with BenchControl(options.directory) as control:
         run = Soak(Client(), control, options.directory, arguments.keep)
         run.learn(arguments.sequences.split(","))
+        ended = threading.Event()
+        signal.signal(signal.SIGINT, lambda *_: ended.set())  # the figures so far are told
         for index in range(arguments.scans):
             what = plan(draw, run.frames)
             if arguments.verbose:
@@ -536,6 +543,8 @@ def soak(arguments: argparse.Namespace, options: GraphOptions) -> dict[str, Any]
                 totals = dict(sum(run.books.values(), Counter()))
                 spent = {name: round(seconds) for name, seconds in run.spent_s.items()}
                 print(f"{index + 1} scans, {lasted_s:.0f} s {spent}: {totals}", flush=True)
+            if ended.is_set():
+                break
         return {**run.report(), "seed": arguments.seed, "lasted_s": time.monotonic() - began_s}
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from sl_bringup import doctor, doctor_checks
+from sl_bringup import doctor, doctor_checks, doctor_devices
 from sl_bringup.cli import main
 from sl_bringup.doctor_checks import Finding
 from sl_bringup.graph import GraphOptions
@@ -82,10 +82,8 @@ def test_a_check_that_fails_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> Non
         ("firewire:1", "expected aravis:SERIAL"),
     ],
 )
-def test_cameras_that_are_not_there(tmp_path: Path, address: str, text: str) -> None:
-    config = tmp_path / "rig.yaml"
-    config.write_text(f"/sl/camera: {{ros__parameters: {{address: '{address}'}}}}")
-    finding = doctor_checks.camera(config, bench=False)[0]
+def test_cameras_that_are_not_there(address: str, text: str) -> None:
+    finding = doctor_devices.camera({"address": address}, running=False)[0]
     assert finding.level == "bad"
     assert text in finding.text
     assert finding.remedy

@@ -251,7 +251,8 @@ class CameraEmulator:
 
     def on_exposure(self, mirrors: Mirrors, index: int, start_ns: int, exposure_s: float) -> None:
         """Take the DMD's trigger edge; quick, called from the DMD's thread at the edge."""
-        self._shown.append((start_ns, exposure_s, mirrors))
+        if not self._shown or self._shown[-1][0] != start_ns:  # a doubled edge is no more light
+            self._shown.append((start_ns, exposure_s, mirrors))
         if self._settings.trigger == "hardware":
             self._expose(start_ns)
 

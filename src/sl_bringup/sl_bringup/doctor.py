@@ -8,7 +8,7 @@ from typing import Any
 
 from sl_bringup import doctor_checks as checks
 from sl_bringup.doctor_checks import Finding
-from sl_bringup.graph import GraphOptions
+from sl_bringup.graph import GraphOptions, is_running
 from sl_bringup.progress import say
 from sl_bringup.up import add_graph_arguments, graph_options
 
@@ -17,16 +17,21 @@ _MARKS = {"ok": "ok  ", "note": "note", "bad": "BAD "}
 
 def examine(options: GraphOptions) -> list[Finding]:
     """Check everything; a check that fails by itself is a finding too."""
-    on_devices: list[Callable[[], list[Finding]]] = [
-        lambda: checks.projector(options.source, bench=options.bench),
-        lambda: checks.serial_ports(options.source, bench=options.bench),
-        lambda: checks.camera(options.source, bench=options.bench),
-    ]
     steps: list[Callable[[], list[Finding]]] = [
         checks.python, checks.libraries, checks.ros, checks.shared_memory,
-        lambda: checks.configuration(options), *on_devices, lambda: checks.graph(options),
+        lambda: checks.configuration(options), lambda: _devices(options),
+        lambda: checks.graph(options),
     ]  # fmt: skip
     return [finding for step in steps for finding in _guarded(step)]
+
+
+def _devices(options: GraphOptions) -> list[Finding]:
+    if options.bench:
+        return []
+    # Imported late: the drivers need libraries that may be what is missing.
+    from sl_bringup.doctor_devices import devices
+
+    return devices(options.source, is_running(options.directory))
 
 
 def _guarded(step: Callable[[], list[Finding]]) -> list[Finding]:
@@ -42,8 +47,10 @@ def add_parser(subparsers: Any) -> None:
         "doctor",
         help="say what is missing on this machine, and what to do",
         description="Check Python, libraries, ROS, shared memory, configuration, devices and the "
-        "running graph. With --bench nothing about hardware is asked for. The exit status is 0 "
-        "when nothing that is needed is missing.",
+        "running graph. Devices are asked how they are and never moved; those of a running graph "
+        "are left to it, and it tells. (An Arduino at a serial port restarts when it is opened.) "
+        "With --bench nothing about hardware is asked for. The exit status is 0 when nothing that "
+        "is needed is missing.",
         epilog="examples:\n  slrig doctor --bench\n  slrig doctor --config my_rig.yaml",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

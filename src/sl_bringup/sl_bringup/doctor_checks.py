@@ -23,11 +23,7 @@ from sl_bringup.transport import (
     SMALL_SEGMENT_BYTES,
     free_bytes,
 )
-from sl_camera.aravis_library import INSTALL as ARAVIS_INSTALL
-from sl_camera.aravis_library import find_camera, list_cameras, load_aravis
-from sl_camera.camera_drivers import make_camera
-from sl_projector.dmd import DEFAULT_MODEL, MODELS
-from sl_projector.errors import DeviceLost, SlError
+from sl_projector.errors import SlError
 
 PYTHON_RANGE = ((3, 11), (3, 13))
 #: Module and the name under which pip knows it.
@@ -36,13 +32,6 @@ LIBRARIES = {
     "yaml": "PyYAML", "usb.core": "pyusb", "serial": "pyserial", "rosbags": "rosbags",
     "matplotlib": "matplotlib", "plyfile": "plyfile",
 }  # fmt: skip
-#: USB vendor and product of each controller.
-CONTROLLER_IDS = {"DLPC900": (0x0451, 0xC900), "DLPC350": (0x0451, 0x6401)}
-UDEV_FILE = Path("/etc/udev/rules.d/70-slrig.rules")
-UDEV_RULE = (
-    'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="0451", ATTRS{{idProduct}}=="{product:04x}", '
-    'MODE="0660", GROUP="plugdev", TAG+="uaccess"'
-)
 INSTALL = "make venv"
 
 
@@ -187,119 +176,28 @@ def _calibration(file: str) -> Finding:
     return Finding("ok", "calibration", f"{file} ({calibration.hash[:12]})")
 
 
-def projector(source: Path, bench: bool) -> list[Finding]:
-    """The projector's controller on the USB, and the permission to use it."""
-    if bench:
-        return []
-    import usb.core
-
-    dmd = _parameter(source, "projector", "dmd_model") or DEFAULT_MODEL
-    chip = MODELS[dmd].controller if dmd in MODELS else MODELS[DEFAULT_MODEL].controller
-    vendor, product = CONTROLLER_IDS[chip]
-    try:
-        device = usb.core.find(idVendor=vendor, idProduct=product)
-    except usb.core.NoBackendError:
-        return [Finding("bad", "projector", "no libusb", "apt install libusb-1.0-0")]
-    if device is None:
-        remedy = "plug it in and switch it on; without hardware: --bench"
-        text = f"no {chip} ({vendor:04x}:{product:04x}) on the USB"
-        return [Finding("bad", "projector", text, remedy)]
-    node = Path(f"/dev/bus/usb/{device.bus:03d}/{device.address:03d}")
-    if not os.access(node, os.R_OK | os.W_OK):
-        rule = UDEV_RULE.format(product=product)
-        remedy = f"echo '{rule}' | sudo tee {UDEV_FILE}; sudo udevadm control --reload; replug"
-        return [Finding("bad", "projector", f"no permission for {node}", remedy)]
-    return [Finding("ok", "projector", f"{chip} at {node}")]
-
-
-def _parameter(source: Path, node: str, name: str) -> str:
-    sections = yaml.safe_load(source.read_text()) or {}
-    return str(sections.get(f"/sl/{node}", {}).get("ros__parameters", {}).get(name, ""))
-
-
-def serial_ports(source: Path, bench: bool) -> list[Finding]:
-    """The stage's port, and the permission to use it."""
-    if bench:
-        return []
-    from serial.tools.list_ports import comports
-
-    there = [port.device for port in comports()]
-    found = [Finding("note", "serial ports", ", ".join(there) or "none on this machine")]
-    port = _parameter(source, "stage", "port")
-    if not port:
-        return [*found, Finding("note", "stage", "the configuration names no port")]
-    if not Path(port).exists():
-        remedy = "plug it in, or name another port in the configuration"
-        return [*found, Finding("bad", "stage", f"no port {port}", remedy)]
-    if not os.access(port, os.R_OK | os.W_OK):
-        remedy = "sudo usermod -aG dialout $USER, then log in again"
-        return [*found, Finding("bad", "stage", f"no permission for {port}", remedy)]
-    return [*found, Finding("ok", "stage", port)]
-
-
-def camera(source: Path, bench: bool) -> list[Finding]:
-    """The camera that the configuration names, and those that answer."""
-    if bench:
-        return []
-    address = _parameter(source, "camera", "address")
-    if not address:
-        remedy = "put its address into the configuration (docs/cameras.md)"
-        return [Finding("note", "camera", "no address in the configuration", remedy), _aravis()]
-    try:
-        make_camera(address)
-    except SlError as error:
-        return [Finding("bad", "camera", str(error), "correct the configuration")]
-    kind, _, place = address.rpartition(":")
-    if kind == "aravis":
-        return [_genicam(place)]
-    if kind == "uvc":
-        return [_video(place), _aravis()]
-    if not Path(place).exists():
-        remedy = "start the process that serves the camera, or correct the configuration"
-        return [Finding("bad", "camera", f"nothing at {place}", remedy), _aravis()]
-    return [Finding("ok", "camera", address), _aravis()]
-
-
-def _aravis() -> Finding:
-    text = "there" if _there("gi") else "not installed; only cameras over GenICam need it"
-    return Finding("note", "Aravis", text)
-
-
-def _genicam(name: str) -> Finding:
-    try:
-        found = find_camera(load_aravis(), name)
-        others = ", ".join(list_cameras())
-    except DeviceLost as error:
-        return Finding("bad", "camera", str(error), "arv-tool-0.8   (package aravis-tools-cli)")
-    except SlError as error:
-        return Finding("bad", "camera", str(error), ARAVIS_INSTALL)
-    return Finding("ok", "camera", f"{found} (answering: {others or 'none'})")
-
-
-def _video(device: str) -> Finding:
-    path = Path(f"/dev/video{device}") if device.isdigit() else Path(device)
-    if not path.exists():
-        there = ", ".join(map(str, sorted(Path("/dev").glob("video*")))) or "none"
-        remedy = "plug it in, or name another (v4l2-ctl --list-devices)"
-        return Finding("bad", "camera", f"no {path}; there are: {there}", remedy)
-    if not os.access(path, os.R_OK | os.W_OK):
-        remedy = "sudo usermod -aG video $USER, then log in again"
-        return Finding("bad", "camera", f"no permission for {path}", remedy)
-    return Finding("ok", "camera", str(path))
-
-
 def graph(options: GraphOptions) -> list[Finding]:
     """A running graph and what its nodes say."""
     if not _there("rclpy"):
         return []
-    command = client_command("sl_bringup.ready_node", options, "--nodes", *NODES, "--timeout", "4")
+    wanted = ("--nodes", *NODES, "--timeout", "4", "--states")
+    command = client_command("sl_bringup.ready_node", options, *wanted)
     asked: Any = subprocess.run(
         command, env=client_environment(options), capture_output=True, text=True, check=False
     )
+    states = [_state(line) for line in asked.stdout.splitlines() if " | " in line]
     if asked.returncode == 0:
-        return [Finding("ok", "graph", f"running and ready in domain {options.domain}")]
+        return [Finding("ok", "graph", f"running and ready in domain {options.domain}"), *states]
     complaint = asked.stderr.strip().removeprefix("graph not ready: ")
     if all(f"{name} is silent" in complaint for name in NODES):
-        remedy = f"slrig up{' --bench' if options.bench else ''}"
+        remedy = "slrig up" + (" --bench" if options.bench else "")
+        remedy += f" --config {options.config}" if options.config else ""
         return [Finding("note", "graph", f"none runs in domain {options.domain}", remedy)]
-    return [Finding("bad", "graph", complaint, "see the nodes' log; slrig up restarts dead ones")]
+    remedy = "see the nodes' log; slrig up restarts dead ones"
+    return [Finding("bad", "graph", complaint, remedy), *states]
+
+
+def _state(line: str) -> Finding:
+    """What a node of the running graph says of itself: the devices are its own meanwhile."""
+    name, level, message = line.split(" | ", 2)
+    return Finding("ok" if level == "ok" else "note", f"  {name}", message)

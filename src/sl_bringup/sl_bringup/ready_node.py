@@ -66,6 +66,11 @@ class ReadyNode(Node):  # type: ignore[misc]  # rclpy carries no types
         prefix = self.get_namespace().rstrip("/")
         return found + [f"no service {s}" for s in SERVICES if f"{prefix}/{s}" not in offered]
 
+    def states(self) -> list[str]:
+        """Each node's name, level and last word, "NAME | ok | ready"."""
+        words = {DiagnosticStatus.OK: "ok", DiagnosticStatus.WARN: "warning"}
+        return [f"{n} | {words.get(v, 'error')} | {text}" for n, (v, text) in self._said.items()]
+
     def _fault(self, name: str) -> str:
         if name not in self._said:
             return f"{name} is silent"
@@ -94,12 +99,15 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--namespace", default="/sl")
     parser.add_argument("--nodes", nargs="+", required=True)
+    parser.add_argument("--states", action="store_true", help="tell what each node said at last")
     parser.add_argument("--timeout", type=float, default=0.0, help="seconds; 0: wait for ever")
     options = parser.parse_args(args)
     try:
         rclpy.init(args=[])
         node = ReadyNode(options.namespace, options.nodes)
         ready = wait(node, options.timeout)
+        for line in node.states() if options.states else []:
+            say(line)
         if ready and node.uncalibrated:
             say("the rig is not calibrated: put the hole plate on and run 'slrig calibrate'")
         return 0 if ready else 1

@@ -100,10 +100,11 @@ class Dlpc350(Dlpc900):
         self._wake(port)
         port.write(common.START_STOP, bytes([common.STOP]))
         self._set_triggers(port)
-        self._check_flash(port)
+        self._identify(port)
         self._check_hardware(port, "opening")
 
-    def _check_flash(self, port: Dlpc900Port) -> None:
+    def _identify(self, port: Dlpc900Port) -> None:
+        """Make sure of the flash; there is one DMD with this controller."""
         needed = 1 + max((image for image, _ in self._flash.values()), default=-1)
         try:
             found = port.read(protocol.IMAGES_IN_FLASH)[0]

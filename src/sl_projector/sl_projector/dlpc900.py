@@ -161,6 +161,27 @@ class Dlpc900:
                 self._release()
                 raise
 
+    def look(self) -> ProjectorStatus:
+        """Connect, ask how the device is, and disconnect; nothing about it changes.
+
+        Raises
+        ------
+        DeviceLost
+            When it is not there or another program has it.
+        DeviceError
+            When it is of another model or does not answer.
+        """
+        with self._lock:
+            self._release()
+            transport = open_usb(self._device, protocol.VENDOR_ID, self._product_id, self._backend)
+            self._port = self._port_class(transport, self._settings.reply_timeout_s, self._clock)
+            try:
+                self._port.drain()
+                self._identify(self._port)
+                return self.status()
+            finally:
+                self._release()
+
     def _release(self) -> None:
         self._stopped.set()
         self._loaded = self._run = None
@@ -172,14 +193,15 @@ class Dlpc900:
     def _prepare(self, port: Dlpc900Port) -> None:
         port.drain()
         self._wake(port)
-        self._check_model(port)
+        self._identify(port)
         port.write(protocol.START_STOP, bytes([protocol.STOP]))
         self._leave_idle(port)
         port.write(protocol.LED_ENABLE, bytes([protocol.LEDS_BY_SEQUENCER]))
         self._set_triggers(port)
         self._check_hardware(port, "opening")
 
-    def _check_model(self, port: Dlpc900Port) -> None:
+    def _identify(self, port: Dlpc900Port) -> None:
+        """Make sure of the DMD."""
         code = port.read(protocol.HARDWARE)[0]
         if code != self._model.hardware_code:
             known = {m.hardware_code: m.name for m in MODELS.values()}
