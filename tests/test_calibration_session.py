@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibration_bench import HEIGHTS_M, PLACES, START, Bench
+from calibration_bench import HEIGHTS_M, PLACES, START, Bench, FakeRig
 from calibration_scenes import RIG
 from plate_scenes import drawn, pinhole
 from sl_bench.optics import Optics
@@ -22,7 +23,7 @@ from sl_calibration.conclude import solve_stored
 from sl_calibration.detect import find_plate
 from sl_calibration.observe import observe, white_image
 from sl_calibration.plate import DEFAULT_PLATE, Plate
-from sl_calibration.session import Order, Taken
+from sl_calibration.session import Order, Place, Progress, Session, Taken
 from sl_calibration.store import CALIBRATION, OBSERVATIONS, Store
 from sl_calibration.uncertainty import Limits
 from sl_calibration.verify import triangulate
@@ -160,6 +161,21 @@ def test_a_cancelled_run_stops_the_stage_and_leaves_the_old_calibration(bench: B
     assert bench.rig.halted
     assert bench.rig.moves == PLACES[:2]
     assert bench.store.current() == Path(first.calibration_file)
+
+
+def test_a_view_is_looked_at_while_the_next_is_taken() -> None:
+    moved_on = threading.Event()
+
+    def look(taken: Taken, _: Order) -> Place:
+        assert taken.place != PLACES[0] or moved_on.wait(15.0)
+        return taken.place
+
+    def tell(progress: Progress) -> None:
+        if progress.view == 2:
+            moved_on.set()
+
+    order = Order("both", HEIGHTS_M, Plate(), "precise-rows")
+    assert Session(FakeRig(), order, look, tell).views() == tuple(PLACES)
 
 
 def test_a_device_that_fails_is_the_answer_and_the_stage_goes_back(bench: Bench) -> None:

@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from sl_calibration.table_1 import PAPER_TABLE_1, table_1
+
 #: Tsai & Hung (2005), Table 2: the developed system, and the stylus instrument (Talyscan-150).
 PAPER_TABLE_2: Mapping[str, tuple[str, str]] = {
     "Plane 1, Z in mm": ("-0.2265X + 0.0016Y + 0.0044", "-0.2159X + 0.0035Y + 0.0014"),
@@ -20,9 +22,6 @@ PAPER_TABLE_2: Mapping[str, tuple[str, str]] = {
 
 def table_1_lines(report: Mapping[str, Any]) -> Iterator[str]:
     """Lines of Table 1 from a calibration's ``report.json``."""
-    # Imported late: it brings the solver and the drawing with it, a second that scans do without.
-    from sl_calibration.report import PAPER_TABLE_1, table_1
-
     yield from _lines(
         ("Table 1: parameters, +- 1 sigma", "projection device", "camera"),
         [row[:3] for row in table_1(report)],

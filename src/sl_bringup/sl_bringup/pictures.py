@@ -229,6 +229,6 @@ def broken_at_gaps(x: NDArray[Any], *values: NDArray[Any]) -> tuple[NDArray[Any]
 def png(figure: Figure) -> bytes:
     """PNG of a figure, drawn without a display."""
     buffer = io.BytesIO()
-    FigureCanvasAgg(figure)
-    figure.savefig(buffer, format="png", pil_kwargs={"compress_level": 4})
+    # Not `savefig`: that draws twice, once for the layout.
+    FigureCanvasAgg(figure).print_png(buffer, pil_kwargs={"compress_level": 4})
     return buffer.getvalue()

@@ -29,8 +29,8 @@ _MOST_ARROWS = 600
 def png(figure: Figure) -> bytes:
     """Picture of a figure."""
     buffer = io.BytesIO()
-    FigureCanvasAgg(figure)  # drawn by it from here on
-    figure.savefig(buffer, format="png")
+    # Not `savefig`: that draws twice, once for the layout.
+    FigureCanvasAgg(figure).print_png(buffer)
     return buffer.getvalue()
 
 

@@ -7,8 +7,9 @@ what they see, ends the run with a refusal that says what was found and what was
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -249,27 +250,38 @@ class Session(Generic[_SeenT]):
         return views
 
     def _take_all(self, places: list[Place]) -> tuple[_SeenT, ...]:
+        """Look at each view in a thread beside, while the stage moves on and the next is taken."""
         views: list[_SeenT] = []
-        for i, place in enumerate(places):
-            try:
-                view = self._take(i, place)
-                if views:
-                    self._compare(views[-1], view)
-            except CalibrationError as error:
-                raise CalibrationError(
-                    f"view {i + 1} of {len(places)}, stage at {in_words(place)}: {error}"
-                ) from error
-            views.append(view)
+        looked: list[Future[_SeenT]] = []
+        with ThreadPoolExecutor(1, "look") as beside:
+            for i, place in enumerate(places):
+                with _naming(i, places):
+                    taken = self._take(i, place)
+                looked.append(beside.submit(self._observe, taken, self._order))
+                del taken  # a stack is large: two at a time
+                if i:
+                    self._accept(i - 1, places, looked, views)
+            self._accept(len(places) - 1, places, looked, views)
         return tuple(views)
 
-    def _take(self, i: int, place: Place) -> _SeenT:
+    def _accept(
+        self, i: int, places: list[Place], looked: list[Future[_SeenT]], views: list[_SeenT]
+    ) -> None:
+        """Wait for what was seen in a view, and compare it with the one before."""
+        with _naming(i, places):
+            view = looked[i].result()
+            if views:
+                self._compare(views[-1], view)
+        views.append(view)
+
+    def _take(self, i: int, place: Place) -> Taken:
         self._report("home", i)
         self._check_place(self._gear.move(place), place)
         self._report("planes", i)
         taken = self._gear.take(self._order.sequence)
         self._check_place(taken.place, place)
         self._report("plate", i)
-        return self._observe(taken, self._order)
+        return taken
 
     def _check_place(self, found: Place, asked: Place) -> None:
         if not all(abs(f - a) <= self._tolerance_m for f, a in zip(found, asked, strict=True)):
@@ -282,6 +294,17 @@ class Session(Generic[_SeenT]):
         views = len(self._order.places)
         fraction = _TAKING * (i + _BEGINS[stage]) / views
         self._tell(Progress(stage, i + 1, views, fraction))
+
+
+@contextmanager
+def _naming(i: int, places: list[Place]) -> Iterator[None]:
+    """Say in which view it was that something was wrong."""
+    try:
+        yield
+    except CalibrationError as error:
+        raise CalibrationError(
+            f"view {i + 1} of {len(places)}, stage at {in_words(places[i])}: {error}"
+        ) from error
 
 
 def in_words(place: Place) -> str:
