@@ -184,18 +184,27 @@ def hole_distance(surface: Any, x: float, y: float) -> Any:
 
 
 @inlined
-def albedo(surface: Any, x: float, y: float, footprint_m: float) -> Any:
-    """Reflectance of the shape itself, relative to the finish, over a footprint of that width."""
+def albedo(surface: Any, x: float, y: float) -> Any:
+    """Reflectance of the shape itself, relative to the finish."""
     if surface.kind != HOLES:
         return 1.0
     r, radius, _, _ = hole_distance(surface, x, y)
+    return 1.0 if r > radius or radius == 0.0 else surface.params[2]
+
+
+@inlined
+def rim_distance(surface: Any, x: float, y: float) -> Any:
+    """Distance outside the nearest rim of the nearest hole, and that rim's radius.
+
+    A chamfer has a rim at its bottom and one at its top; (inf, 0) where there is no hole.
+    """
+    if surface.kind != HOLES:
+        return np.inf, 0.0
+    r, radius, _, _ = hole_distance(surface, x, y)
     if radius == 0.0:
-        return 1.0
-    if footprint_m > 0.0:
-        outside = min(max((r - radius) / footprint_m + 0.5, 0.0), 1.0)
-    else:
-        outside = 1.0 if r > radius else 0.0
-    return surface.params[2] + (1.0 - surface.params[2]) * outside
+        return np.inf, 0.0
+    top = radius + surface.params[1]
+    return (r - radius, radius) if r < 0.5 * (radius + top) else (r - top, top)
 
 
 @inlined

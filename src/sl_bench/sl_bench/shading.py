@@ -20,6 +20,14 @@ NOWHERE_PX = -1e6
 MAX_BLUR_PX = 5.0
 #: DMD pixels per camera pixel beyond which a map's gradient is a jump, not a slope.
 MAX_GRADIENT = 6.0
+#: Spacing of the samples, camera px; each stands for a square of that side.
+SAMPLE_PX = 0.5
+#: A sample nearer to a hole's rim than this many times its side may straddle it: half a diagonal,
+#: seen along a 45 degree slope that leans away.
+RIM_REACH = 2.0
+#: Lines through a sample that straddles a rim, and steps to where the rim crosses each.
+RIM_LINES = 4
+RIM_STEPS = 5
 
 
 class Light(NamedTuple):
@@ -140,17 +148,20 @@ def _defocused(depth: float, focus: float, per_m: float) -> Any:
 
 @inlined
 def sample(surface: Any, camera: Any, projector: Any, light: Any, qu: float, qv: float) -> Any:
-    """One camera sample: (u, v, reflected, ambient, projector variance, extra lens blur).
+    """One camera ray: (u, v, reflected, ambient, projector variance, extra lens blur, at a rim).
 
-    (u, v) is the DMD coordinate that lights what the sample sees, px; reflected and ambient are
+    (u, v) is the DMD coordinate that lights what the ray sees, px; reflected and ambient are
     relative to white; the variance is in DMD px^2, the lens blur beyond focus in camera px.
+    At a rim there is a hole's rim within reach of a sample about the ray.
     """
     o, d = camera.position_m, raycast.ray(camera, qu, qv)
     t, nx, ny, nz = raycast.first_hit(surface, (o[0], o[1], o[2]), d)
     if not t < np.inf:
-        return NOWHERE_PX, NOWHERE_PX, 0.0, 0.0, 0.0, 0.0
+        return NOWHERE_PX, NOWHERE_PX, 0.0, 0.0, 0.0, 0.0, False
     p = (o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2])
-    base = raycast.albedo(surface, p[0], p[1], 0.5 * t / camera.focal_px[0])
+    off, _ = raycast.rim_distance(surface, p[0], p[1])
+    at_rim = abs(off) < RIM_REACH * SAMPLE_PX * t / camera.focal_px[0]
+    base = raycast.albedo(surface, p[0], p[1])
     base *= _fall_off(camera.size_px, qu, qv, light.vignetting)
     if light.texture > 0.0:
         base *= 1.0 + light.texture * _texture(p[0] / light.texture_m, p[1] / light.texture_m)
@@ -159,13 +170,83 @@ def sample(surface: Any, camera: Any, projector: Any, light: Any, qu: float, qv:
     spread = _defocused(depth, light.projector_focus_m, light.projector_defocus)
     extra = _defocused(t, light.lens_focus_m, light.lens_defocus)
     if not (abs(u) < 1e5 and abs(v) < 1e5):
-        return NOWHERE_PX, NOWHERE_PX, 0.0, ambient, 0.0, extra
+        return NOWHERE_PX, NOWHERE_PX, 0.0, ambient, 0.0, extra, at_rim
     reflected = 0.0
     pad = 4.0 * MAX_BLUR_PX
     if -pad < u < projector.size_px[0] + pad and -pad < v < projector.size_px[1] + pad:
         reflected = _reflected(surface, projector, light, p, (nx, ny, nz), d, base)
         reflected *= _fall_off(projector.size_px, u, v, light.uneven)
-    return u, v, reflected, ambient, light.projector_blur_px**2 + spread * spread, extra
+    variance = light.projector_blur_px**2 + spread * spread
+    return u, v, reflected, ambient, variance, extra, at_rim
+
+
+@inlined
+def _off_rim(surface: Any, camera: Any, qu: float, qv: float, rim_m: float) -> Any:
+    """Distance outside a circle about the axis of the hole that a camera ray sees."""
+    o, d = camera.position_m, raycast.ray(camera, qu, qv)
+    t, _, _, _ = raycast.first_hit(surface, (o[0], o[1], o[2]), d)
+    return raycast.hole_distance(surface, o[0] + t * d[0], o[1] + t * d[1])[0] - rim_m
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _crossing(surface: Any, camera: Any, q: Any, along: Any, rim_m: float) -> Any:
+    """Where in [-1, 1] a line ``q + x along`` crosses a rim; 1 where it does not (Illinois)."""
+    a, b = -1.0, 1.0
+    fa = _off_rim(surface, camera, q[0] - along[0], q[1] - along[1], rim_m)
+    fb = _off_rim(surface, camera, q[0] + along[0], q[1] + along[1], rim_m)
+    if (fa > 0.0) == (fb > 0.0):
+        return 1.0
+    x = a
+    for _ in range(RIM_STEPS):
+        x = (a * fb - b * fa) / (fb - fa)
+        f = _off_rim(surface, camera, q[0] + x * along[0], q[1] + x * along[1], rim_m)
+        if (f > 0.0) == (fb > 0.0):
+            b, fb, fa = x, f, 0.5 * fa
+        else:
+            a, fa, fb = x, f, 0.5 * fb
+    return x
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _across_rim(surface: Any, camera: Any, q: Any, rim_m: float) -> Any:
+    """Half a sample's side (du, dv) along the image axis that crosses the rim more squarely."""
+    h = 0.5 * SAMPLE_PX
+    by_u = _off_rim(surface, camera, q[0] + h, q[1], rim_m)
+    by_u -= _off_rim(surface, camera, q[0] - h, q[1], rim_m)
+    by_v = _off_rim(surface, camera, q[0], q[1] + h, rim_m)
+    by_v -= _off_rim(surface, camera, q[0], q[1] - h, rim_m)
+    return (h, 0.0) if abs(by_u) > abs(by_v) else (0.0, h)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def straddling(surface: Any, camera: Any, projector: Any, light: Any, q: Any) -> Any:
+    """Mean (reflected, ambient) over a sample that straddles rims of a hole.
+
+    On each of a few lines through the sample, hole, chamfer and face count with their exact
+    lengths: a ramp over the rim would shift it where slope and floor are foreshortened unlike.
+    """
+    o, d = camera.position_m, raycast.ray(camera, q[0], q[1])
+    t, _, _, _ = raycast.first_hit(surface, (o[0], o[1], o[2]), d)
+    _, rim_m = raycast.rim_distance(surface, o[0] + t * d[0], o[1] + t * d[1])
+    _, radius_m, _, _ = raycast.hole_distance(surface, o[0] + t * d[0], o[1] + t * d[1])
+    along = _across_rim(surface, camera, q, rim_m)
+    reflected, ambient = 0.0, 0.0
+    for line in range(RIM_LINES):
+        aside = (2.0 * line + 1.0) / RIM_LINES - 1.0
+        at = (q[0] + aside * along[1], q[1] + aside * along[0])
+        one = _crossing(surface, camera, at, along, radius_m)
+        two = _crossing(surface, camera, at, along, radius_m + surface.params[1])
+        start = -1.0
+        for stop in (min(one, two), max(one, two), 1.0):
+            if stop > start:
+                x = 0.5 * (start + stop)
+                found = sample(
+                    surface, camera, projector, light, at[0] + x * along[0], at[1] + x * along[1]
+                )
+                reflected += (stop - start) * found[2]
+                ambient += (stop - start) * found[3]
+                start = stop
+    return reflected / (2.0 * RIM_LINES), ambient / (2.0 * RIM_LINES)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -175,16 +256,18 @@ def trace_rows(
     """Fill rows [rows[0], rows[1]) of six sample maps (2 (H + 2 margin), 2 (W + 2 margin)) float32.
 
     Samples lie at -0.25 and +0.25 px of each pixel; the image has ``margin`` pixels more on each
-    side. Maps are in the order that `sample` returns.
+    side. Maps are in the order that `sample` returns. A sample is what its middle ray sees; where
+    a hole's rim goes through it, its light is the mean over its square.
     """
     surface = raycast.bare(surface)
     for j in range(rows[0], rows[1]):
         for i in range(maps[0].shape[1]):
-            found = sample(
-                surface, camera, projector, light, 0.5 * i - 0.25 - margin, 0.5 * j - 0.25 - margin
-            )
+            q = (SAMPLE_PX * i - 0.25 - margin, SAMPLE_PX * j - 0.25 - margin)
+            found = sample(surface, camera, projector, light, q[0], q[1])
             maps[0][j, i], maps[1][j, i], maps[2][j, i] = found[0], found[1], found[2]
             maps[3][j, i], maps[4][j, i], maps[5][j, i] = found[3], found[4], found[5]
+            if found[6]:
+                maps[2][j, i], maps[3][j, i] = straddling(surface, camera, projector, light, q)
 
 
 @inlined

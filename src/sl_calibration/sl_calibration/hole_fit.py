@@ -1,15 +1,16 @@
 """Sub-pixel holes: a blurred elliptic step is fitted to the pixels around each hole's edge.
 
-Model of a pixel at x: ``D + (P0 + P1 q1 + P2 q2 - D) Phi(d / s)`` with ``q = M (x - c)``, which
-maps the ellipse on the unit circle, and ``d = (|q| - 1) / |grad |q||`` the distance from the edge
-(to first order; exact for a circle). c centre, M symmetric (3 numbers), s blur, D level in the
-hole, P0..P2 level of the plate and its slope: uneven light does not move the centre. Least
+Model of a pixel at x: ``L (D + (P0 - D) Phi(d / s)) + s (grad P . n) phi(d / s)`` with
+``q = M (x - c)``, which maps the ellipse on the unit circle, and ``d = (|q| - 1) / |grad |q||`` the
+distance from the edge (to first order; exact for a circle) along its normal n. c centre,
+M symmetric (3 numbers), s blur, D level in the hole, P0 level of the plate, and the light
+``L = 1 + (P1 q1 + P2 q2) / P0``: uneven light does not move the centre. Least
 squares over the pixels, weighted by the noise found on each side, is the matched filter of every
 edge point and the ellipse fit in one, and its normal equations give the covariance.
 
 A chamfer adds a second step: its outer rim is the same ellipse, larger by the known ratio of the
-diameters and shifted by a parallax that is fitted, with a level between the two that may vary
-around the hole as the slope's light does.
+diameters and shifted by a parallax that is fitted, with a level between the two that varies
+around the hole as a cone's light does.
 """
 
 from __future__ import annotations
@@ -241,31 +242,56 @@ def _rim_step(p: Any, q1: float, q2: float, ratio: float, step: float) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _facing(p: Any, q1: float, q2: float, rho: float, ratio: float) -> Any:
+    """Unit vector to where the chamfer faces: its light is the same from bottom to top."""
+    up = min(max((rho - 1.0) / (ratio - 1.0), 0.0), 1.0)
+    e1, e2 = q1 - up * p[SHIFT], q2 - up * p[SHIFT + 1]
+    size = max(math.sqrt(e1 * e1 + e2 * e2), 1e-9)
+    return e1 / size, e2 / size
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _blurred_slope(p: Any, q1: float, q2: float, size: float, bell: float) -> Any:
+    """What blur adds at an edge between 0 and the plate's level: ``s (grad P . n)`` bell.
+
+    A step whose level changes along its normal n is not blurred to a step times that level: in
+    uneven light the centre would move by ``s^2`` times the relative slope.
+    """
+    n1, n2 = p[2] * q1 + p[3] * q2, p[3] * q1 + p[4] * q2
+    g1 = p[2] * p[BRIGHT + 1] + p[3] * p[BRIGHT + 2]
+    g2 = p[3] * p[BRIGHT + 1] + p[4] * p[BRIGHT + 2]
+    return p[BLUR] * bell * (n1 * g1 + n2 * g2) / size
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _model(p: Any, x: float, y: float, ratio: float, row: Any) -> Any:
     """Level of a pixel; its derivatives go to ``row``. Returns (level, Phi)."""
     q1, q2, rho, steep = _distance(p, x, y)
     dx, dy = x - p[0], y - p[1]
     t = (rho - 1.0) / (steep * p[BLUR])
-    phi = 0.5 * math.erfc(-t * SQRT_HALF)
-    bright = p[BRIGHT] + p[BRIGHT + 1] * q1 + p[BRIGHT + 2] * q2
+    phi, bell = 0.5 * math.erfc(-t * SQRT_HALF), INV_SQRT_2PI * math.exp(-0.5 * t * t)
+    light = 1.0 + (p[BRIGHT + 1] * q1 + p[BRIGHT + 2] * q2) / p[BRIGHT]
+    bright, dark = p[BRIGHT] * light, p[DARK] * light
     by1, by2, rim, level = 0.0, 0.0, phi, bright
     if ratio > 1.0:
-        level = p[CHAMFER] + p[CHAMFER + 1] * q1 + p[CHAMFER + 2] * q2
+        c1, c2 = _facing(p, q1, q2, rho, ratio)
+        level = light * (p[CHAMFER] + p[CHAMFER + 1] * c1 + p[CHAMFER + 2] * c2)
         rim, by1, by2, row[BLUR] = _rim_step(p, q1, q2, ratio, bright - level)
         row[SHIFT], row[SHIFT + 1] = -by1, -by2
-        between = phi - rim
-        row[CHAMFER], row[CHAMFER + 1], row[CHAMFER + 2] = between, between * q1, between * q2
+        between = (phi - rim) * light
+        row[CHAMFER], row[CHAMFER + 1], row[CHAMFER + 2] = between, between * c1, between * c2
     else:
         row[BLUR] = 0.0
-    by_d = (level - p[DARK]) * INV_SQRT_2PI * math.exp(-0.5 * t * t) / p[BLUR]
+    by_d = (level - dark) * bell / p[BLUR]
     by1, by2 = by1 + by_d / (steep * rho) * q1, by2 + by_d / (steep * rho) * q2
     row[0] = -(p[2] * by1 + p[3] * by2)
     row[1] = -(p[3] * by1 + p[4] * by2)
     row[2], row[3], row[4] = by1 * dx, by1 * dy + by2 * dx, by2 * dy
     row[BLUR] -= by_d * t
-    row[DARK] = 1.0 - phi
+    row[DARK] = (1.0 - phi) * light
     row[BRIGHT], row[BRIGHT + 1], row[BRIGHT + 2] = rim, rim * q1, rim * q2
-    return p[DARK] + (level - p[DARK]) * phi + (bright - level) * rim, phi
+    tilted = _blurred_slope(p, q1, q2, rho * steep, bell) * (level - dark) / bright
+    return dark + (level - dark) * phi + (bright - level) * rim + tilted, phi
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
