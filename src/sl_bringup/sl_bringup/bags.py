@@ -385,7 +385,8 @@ def _open_directory(bag: Bag, path: Path, stack: ExitStack) -> list[_File]:
 
 def _named_files(reader: DirectoryReader) -> set[str]:
     """Names of the files that the metadata name; compressed ones lie elsewhere meanwhile."""
-    return {Path(str(storage.path)).name for storage in reader.storages}
+    storages: Sequence[Any] = reader.storages
+    return {Path(str(storage.path)).name for storage in storages}
 
 
 def _fast(bag: Bag, storage: Any, stack: ExitStack) -> _Storage:

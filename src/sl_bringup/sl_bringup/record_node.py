@@ -21,7 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from sl_bringup.bag_recorder import BagRecorder
 from sl_bringup.bag_writer import topic_qos
-from sl_bringup.bags import IMAGE, RECORDED_TOPICS, TOPICS, Topic
+from sl_bringup.bags import IMAGE, RECORDED_TOPICS, TOPICS, TRIGGER, Topic
 from sl_bringup.progress import StatusLine, complain, say
 from sl_bringup.version import software_version
 from sl_projector.errors import BagError, SlError
@@ -31,7 +31,7 @@ DEPTH = 256
 #: Stacks and clouds, with ``--all``: each is 20 to 100 MB.
 LARGE_TYPES = ("sl_interfaces/msg/PatternStack", "sensor_msgs/msg/PointCloud2")
 LARGE_DEPTH = 4
-FLUSH_S, LOOK_S, SHOW_S, SILENCE_S = 0.1, 0.5, 1.0, 5.0
+FLUSH_S, LOOK_S, SHOW_S, SILENCE_S, SETTLE_S = 0.1, 0.5, 1.0, 5.0, 1.0
 #: At the end, what has arrived already is still taken.
 DRAIN_S = 0.3
 
@@ -53,7 +53,7 @@ class RecordNode(Node):  # type: ignore[misc]  # rclpy carries no types
         super().__init__("recorder", namespace=namespace)
         self._bag = bag
         self._refused: set[str] = set()
-        self._images = f"{namespace}/{IMAGE.name}"
+        self._images, self._triggers = (f"{namespace}/{t.name}" for t in (IMAGE, TRIGGER))
         self._needed = [f"{namespace}/{topic.name}" for topic in TOPICS]
         self.lost: Counter[str] = Counter()
         #: Why nothing can be written any more; empty while all is well.
@@ -69,6 +69,11 @@ class RecordNode(Node):  # type: ignore[misc]  # rclpy carries no types
     def images(self) -> int:
         """Images recorded."""
         return self._bag.counts[self._images]
+
+    @property
+    def triggers(self) -> int:
+        """Triggers recorded."""
+        return self._bag.counts[self._triggers]
 
     def told(self) -> str:
         """One line: what has been recorded."""
@@ -164,12 +169,13 @@ class _Stop:
         self.asked = True
 
 
-def _spin(node: RecordNode, stop: _Stop) -> None:
+def _spin(node: RecordNode, stop: _Stop, path: Path) -> None:
     """Record until a signal comes, or nothing can be written any more."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    _await_publishers(node, executor, stop)
+    say(f"recording to {path}; Ctrl-C ends it")
     status = StatusLine("recording")
-    silence_s = time.monotonic() + SILENCE_S
     show_s = 0.0
     while not (stop.asked or node.fault):
         executor.spin_once(timeout_sec=FLUSH_S)
@@ -177,13 +183,22 @@ def _spin(node: RecordNode, stop: _Stop) -> None:
         if now_s >= show_s:
             show_s = now_s + SHOW_S
             status.show(node.told())
-        if now_s >= silence_s:
-            silence_s = float("inf")
-            if silent := node.silent():
-                complain(f"slrig record: nobody publishes {', '.join(silent)} yet")
     end_s = time.monotonic() + DRAIN_S
     while time.monotonic() < end_s and not node.fault:
         executor.spin_once(timeout_sec=0.01)
+
+
+def _await_publishers(node: RecordNode, executor: SingleThreadedExecutor, stop: _Stop) -> None:
+    """Record on until all publishers are found, so that a scan that begins then is whole."""
+    end_s = time.monotonic() + SILENCE_S
+    while node.silent() and time.monotonic() < end_s and not stop.asked:
+        executor.spin_once(timeout_sec=FLUSH_S)
+    if silent := node.silent():
+        complain(f"slrig record: nobody publishes {', '.join(silent)} yet")
+        return
+    settled_s = time.monotonic() + SETTLE_S  # they must find this subscriber as well
+    while time.monotonic() < settled_s and not stop.asked:
+        executor.spin_once(timeout_sec=FLUSH_S)
 
 
 def _outcome(node: RecordNode, path: Path) -> Iterator[str]:
@@ -222,10 +237,11 @@ def _record(args: argparse.Namespace, bag: BagRecorder) -> int:
     stop = _Stop()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = RecordNode(args.namespace, bag, args.all)
-    say(f"recording to {args.output}; Ctrl-C ends it")
-    _spin(node, stop)
+    _spin(node, stop, args.output)
     faults = list(_outcome(node, args.output))
     say(f"{args.output}: {node.told()}")
+    if node.images < node.triggers:
+        complain(f"slrig record: note: {node.triggers} triggers, but {node.images} images came")
     for fault in faults:
         complain(f"slrig record: {fault}")
     node.destroy_node()

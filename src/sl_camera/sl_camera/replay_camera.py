@@ -66,7 +66,9 @@ class ReplayCamera:
             reader = AnyReader([self._path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
             reader.open()
         except Exception as error:  # a damaged bag makes the reader fail in any way it can
-            raise DeviceLost(f"no bag at {self._path}: {_words(error)}") from error
+            raise DeviceLost(
+                f"no whole bag at {self._path}: {_words(error)} (slrig repair mends what was cut)"
+            ) from error
         self._reader = reader
         try:
             self._rewind()
