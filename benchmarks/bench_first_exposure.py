@@ -16,13 +16,11 @@ from typing import Any
 
 from sl_bringup.graph import GraphOptions
 
-SEQUENCE = "paper"
-
 
 class Caller:
     """Calls and hears triggers."""
 
-    def __init__(self) -> None:
+    def __init__(self, sequence: str) -> None:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
         from sl_interfaces.msg import PatternTrigger
@@ -31,6 +29,7 @@ class Caller:
         from sl_projector.base_node import EVENTS
 
         rclpy.init()
+        self._sequence = sequence
         self._node = rclpy.create_node("first_exposure", namespace="sl")
         self._scan = self._node.create_client(Scan, "scan")
         self._project = self._node.create_client(Project, "projector/project")
@@ -50,7 +49,7 @@ class Caller:
         """Call once; from the call to the first exposure, milliseconds."""
         self._first_ns.clear()
         done = threading.Event()
-        request = client.srv_type.Request(sequence=SEQUENCE, **fields)
+        request = client.srv_type.Request(sequence=self._sequence, **fields)
         called_ns = time.time_ns()
         future = client.call_async(request)
         future.add_done_callback(lambda _: done.set())
@@ -78,10 +77,11 @@ class Caller:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--domain", type=int, default=0)
+    parser.add_argument("--sequence", default="precise")
     parser.add_argument("--repeats", type=int, default=30)
     arguments = parser.parse_args()
     os.environ.update(GraphOptions(bench=True, domain=arguments.domain).transport.environment())
-    Caller().measure(arguments.repeats)
+    Caller(arguments.sequence).measure(arguments.repeats)
 
 
 if __name__ == "__main__":

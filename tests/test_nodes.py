@@ -6,6 +6,7 @@ Real nodes in one process, drivers without devices, a private ROS domain.
 from __future__ import annotations
 
 import math
+import struct
 import time
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -36,6 +37,8 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from fake_devices import FakeCamera, FakeProjector, FakeStage, WiredPair  # noqa: E402
 from ros_graph import Graph, wait  # noqa: E402
+from sl_bench.dlpc900_emulator import Dlpc900Emulator  # noqa: E402
+from sl_bench.usb_server import EmulatedUsb, UsbSocketServer  # noqa: E402
 from sl_camera.camera import Frame, FrameStatus  # noqa: E402
 from sl_camera.camera_node import CameraNode  # noqa: E402
 from sl_camera.match_events import MatchedStack, PoseEvent  # noqa: E402
@@ -43,7 +46,7 @@ from sl_camera.messages import image_to_msg, pose_to_msg, stack_to_msg  # noqa: 
 from sl_camera.stage_node import StageNode  # noqa: E402
 from sl_camera.synchronizer_node import SynchronizerNode  # noqa: E402
 from sl_projector.base_node import EVENTS, IMAGES, LARGE, LATCHED  # noqa: E402
-from sl_projector.errors import DeviceError, DeviceLost  # noqa: E402
+from sl_projector.errors import ConfigError, DeviceError, DeviceLost  # noqa: E402
 from sl_projector.messages import stamp_from_msg, stamp_to_msg, trigger_to_msg  # noqa: E402
 from sl_projector.projector_node import ProjectorNode  # noqa: E402
 from sl_reconstruct.calibration_file import (  # noqa: E402
@@ -446,6 +449,23 @@ def test_a_projector_that_is_missing_is_told_and_found_when_it_comes() -> None:
         assert (answer.success, answer.message) == (False, "sequencer abort")
         driver.fault = None
         assert project(graph).success
+
+
+def test_trigger_outputs_are_as_the_parameters_say(tmp_path: Path) -> None:
+    dmd = Dlpc900Emulator()
+    server = UsbSocketServer(str(tmp_path / "usb"), EmulatedUsb(dmd))
+    with ros_graph.graph() as graph:
+        node = graph.add(
+            ProjectorNode, device=f"socket:{tmp_path}/usb",
+            trigger_out_rising_delay_s=[1e-3, -20e-6], trigger_out_inverted=[True, False],
+        )  # fmt: skip
+        wait(lambda: node.health().level == "ok", "the projector")
+        for command, inverted, rising_us in ((0x1A1D, 1, 1000), (0x1A1E, 0, -20)):
+            (reply,) = dmd.receive(struct.pack("<BBHH", 0xC0, 1, 2, command))
+            assert struct.unpack_from("<Bhh", reply, 4) == (inverted, rising_us, 0)
+        with pytest.raises(ConfigError, match="two outputs"):
+            graph.add(ProjectorNode, trigger_out_rising_delay_s=[0.0])
+    server.close()
 
 
 def test_a_busy_projector_refuses_and_stop_ends_what_it_shows() -> None:

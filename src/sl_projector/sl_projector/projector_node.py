@@ -33,6 +33,7 @@ from sl_projector.dmd import (
     ProjectorStatus,
     RunInfo,
     Timing,
+    TriggerOut,
     dmd_model,
 )
 from sl_projector.errors import (
@@ -120,6 +121,7 @@ class ProjectorNode(RigNode):
             "device", "usb", "usb, usb:SERIAL, or socket:PATH for one that another process serves"
         )
         self._leds = self.declare("leds", 7, "LEDs: 1 red + 2 green + 4 blue", 0, 7)
+        self._outputs = self._declare_outputs()
         self.declare("sequence", "precise", "sequence of a request that names none", live=True)
         self._flash = self.declare(
             "flash_sequences", ["precise"], "DLPC350: the sequences in its flash, in order"
@@ -132,6 +134,20 @@ class ProjectorNode(RigNode):
         self._idle_after_s = self.declare(
             "idle_after_s", 300.0, "without a scan for so long the mirrors are spared, s", 1.0, 1e6
         )
+
+    def _declare_outputs(self) -> tuple[TriggerOut, TriggerOut]:
+        rising = self.declare(
+            "trigger_out_rising_delay_s", [0.0, 0.0],
+            "TRIG_OUT_1, TRIG_OUT_2: delay of the rising edge, -20e-6 to 20e-3 s",
+        )  # fmt: skip
+        falling = self.declare(
+            "trigger_out_falling_delay_s", [0.0, 0.0], "the same of the falling edge, s"
+        )
+        inverted = self.declare("trigger_out_inverted", [False, False], "polarity of both outputs")
+        if {len(rising), len(falling), len(inverted)} != {2}:
+            raise ConfigError("trigger_out_...: expected a value for each of the two outputs")
+        one, two = (TriggerOut(*of) for of in zip(rising, falling, inverted, strict=True))
+        return one, two
 
     def health(self) -> Health:
         """Device, what it shows, what it complains about."""
@@ -156,8 +172,9 @@ class ProjectorNode(RigNode):
     def _make_configured(self) -> ProjectorDriver:
         if self._model.controller == "DLPC350":
             flash = tuple(named(name, self._model.size) for name in self._flash)
-            return Dlpc350(self._device, Dlpc350Settings(leds=self._leds, flash=flash))
-        return Dlpc900(self._device, self._model, Dlpc900Settings(leds=self._leds))
+            settings = Dlpc350Settings(self._leds, *self._outputs, flash=flash)
+            return Dlpc350(self._device, settings)
+        return Dlpc900(self._device, self._model, Dlpc900Settings(self._leds, *self._outputs))
 
     def _connect(self) -> ProjectorDriver:
         driver = self._make_driver()
