@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -17,6 +18,7 @@ from sl_bringup import calibrate_bag
 from sl_bringup.bag_writer import new_bag
 from sl_bringup.bags import CALIBRATION_RUN, message_class
 from sl_bringup.calibrate_bag import solve_recorded
+from sl_bringup.cli import main
 from sl_calibration.bundle import lens_values
 from sl_calibration.camera_file import load_kept
 from sl_calibration.kept import keep_of
@@ -233,3 +235,33 @@ def test_a_recording_that_tells_of_no_run_gives_all_its_stacks(
     assert "does not tell of a calibration" in notes[0]
     assert SEQUENCE.name == "precise-rows"
     assert PITCHES.camera_m == RIG.camera.pixel_pitch_m
+
+
+def test_a_run_is_exported_for_opencv(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    outcome = bench.calibrate()
+    run, file = Path(outcome.calibration_file).parent, tmp_path / "rig.xml"
+    assert main(["calibrate", "--from", str(run), "--opencv", str(file)]) == 0
+    assert "OpenCV's lens is off the paper's by" in capsys.readouterr().out
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+    rig = outcome.calibration.rig
+    assert storage.getNode("cam_K").mat() == pytest.approx(rig.camera.camera_matrix)
+    # A point in the camera's frame is where OpenCV's R and T say in the projector's.
+    in_camera, in_projector = (
+        d.rotation @ GRID[0] + d.translation_m for d in (rig.camera, rig.projector)
+    )
+    rotation, shift_mm = storage.getNode("R").mat(), storage.getNode("T").mat().ravel()
+    assert rotation @ in_camera * 1e3 + shift_mm == pytest.approx(in_projector * 1e3)
+
+
+def test_the_command_solves_a_run_again(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    outcome = bench.calibrate(travel_m=0.5e-3)
+    run = Path(outcome.calibration_file).parent
+    assert main(["calibrate", "--from", str(run), "--output", str(tmp_path / "again")]) == 0
+    out = capsys.readouterr().out
+    assert outcome.hash in out
+    assert "stage squareness  xy" in out
+    assert main(["calibrate", "--opencv", str(tmp_path / "rig.xml")]) != 0
