@@ -31,14 +31,17 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--output", required=True, type=Path, metavar="BAG", help="bag to be made")
     parser.add_argument(
-        "--all", action="store_true", help="every topic, stacks and clouds included (large)"
+        "--all",
+        action="store_true",
+        help="every topic, stacks and clouds included: 2.5 times as much",
     )
     parser.add_argument(
         "--split", default="0", metavar="SIZE", help="begin another file after so much: 500MB, 2GB"
     )
     parser.add_argument(
         "--compress", action="store_true",
-        help="compress images too (zstd): 10 %% smaller, 5 times slower; small messages always are",
+        help="compress images too (zstd): 10 %% smaller where light is everywhere, 40 %% where half "
+        "the image is dark, for 7 ms of a core per 2 MB; small messages always are",
     )  # fmt: skip
     add_client_arguments(parser)
     parser.set_defaults(run=run)
