@@ -70,6 +70,9 @@ except ImportError:  # tf2 is not among the wheels; the poses are on calibration
 #: Stacks that may wait while one is being worked on; more would fill the memory.
 MAX_WAITING = 2
 FRAMES = (WORLD_FRAME, CAMERA_FRAME, PROJECTOR_FRAME)
+#: What most rigs do not need at once is compiled when the node has run so long: not in the first
+#: minutes, in which everybody waits for something else.
+REST_AFTER_S = 180.0
 
 _SETTINGS = {
     "estimator": "matched, or cubic: the paper's third-order fit with secant and centres by BR8",
@@ -116,6 +119,7 @@ class ReconstructNode(RigNode):
         self.add_on_set_parameters_callback(self._on_parameters)
         self._compiler = None if compiled() else compile_apart()
         self._worker.submit(self._warm_up)
+        self._rest = self.create_timer(REST_AFTER_S, self._compile_rest, clock=self.steady)
 
     def _offer_scan(self) -> None:
         group = self.long_work
@@ -195,13 +199,19 @@ class ReconstructNode(RigNode):
                 self._compiler.wait()
             if self.context.ok():
                 warm_up()
-                self._compiler = None if compiled(rest=True) else compile_apart(rest=True)
         except Exception as error:  # the first real stack will say it again
             self.get_logger().error(f"warm-up failed: {error!r}")
         self._ready = True
         self.get_logger().info(
             "ready" if self._workshop.calibration_hash else self._calibration_fault
         )
+
+    def _compile_rest(self) -> None:
+        """Compile row patterns and 16-bit images apart, once and while nobody scans."""
+        if self._ready and not self._scanning.locked():
+            self._rest.cancel()
+            if not compiled(rest=True):
+                self._compiler = compile_apart(rest=True)
 
     # -- calibration --------------------------------------------------------------------------
 
