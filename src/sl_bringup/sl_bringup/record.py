@@ -40,8 +40,8 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument(
         "--compress", action="store_true",
-        help="compress images too (zstd): 10 %% smaller where light is everywhere, 40 %% where half "
-        "the image is dark, for 7 ms of a core per 2 MB; small messages always are",
+        help="images too (zstd): 10 %% smaller where all is lit, 40 %% where half is not, "
+        "for 7 ms of a core per 2 MB; small messages always are",
     )  # fmt: skip
     add_client_arguments(parser)
     parser.set_defaults(run=run)
