@@ -132,9 +132,12 @@ def test_a_sweep_compares_settings(
         assert row["settings_hash"] == Settings(estimator=estimator).hash()
     # The paper's fit is noisier than the matched filter on the same images.
     assert table[1]["plane_rms_m"] > table[0]["plane_rms_m"]
+    # Two estimates from the same images err together: they differ by less than each errs.
+    assert 0 == table[0]["z_off_first_m"] < table[1]["z_off_first_m"] < table[1]["plane_rms_m"]
     assert "estimator=cubic" in capsys.readouterr().out
     page = (out / "sweep.html").read_text()
     assert page.count("data:image/png") == 4
+    assert json.loads((out / "sweep.json").read_text())["common"] == []
 
 
 def test_sweeps_multiply() -> None:

@@ -176,7 +176,8 @@ def _tell(
         for task, outcome in outcomes:
             yield from _tell_bag(task, outcome, several=len(outcomes) > 1)
     if args.sweep:
-        for line in write_sweep(args.output, [(v, _reports(o)) for v, o in results]):
+        found = [(v, _reports(o)) for v, o in results]
+        for line in write_sweep(args.output, found, args.assignments):
             say(line)
 
 

@@ -15,11 +15,17 @@ import numpy as np
 from sl_bringup.report import micrometres, page, write_json
 from sl_projector.documents import write_text
 from sl_projector.errors import ConfigError
+from sl_reconstruct.cloud_reading import read_cloud
 
+#: Standard deviation over the median of absolute values, of a normal distribution.
+MAD = 1.4826
 #: More would be a mistake: each is a whole evaluation.
 MAX_VARIANTS = 64
 PICTURES = ("picture_residual.png", "picture_refusals.png")
-COLUMNS = ("scans", "good", "points", "of the lit", "sigma of z", "noise / bound", "plane rms")
+COLUMNS = (
+    "scans", "good", "points", "of the lit", "sigma of z", "noise / bound", "plane rms",
+    "z off first",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,9 @@ def _axis(sweep: str) -> list[str]:
 
 
 def write_sweep(
-    output: Path, results: Sequence[tuple[Variant, Sequence[tuple[Path, Mapping[str, Any]]]]]
+    output: Path,
+    results: Sequence[tuple[Variant, Sequence[tuple[Path, Mapping[str, Any]]]]],
+    common: Sequence[str] = (),
 ) -> list[str]:
     """Write ``sweep.json`` and ``sweep.html``.
 
@@ -76,20 +84,28 @@ def write_sweep(
         For both.
     results : sequence of (Variant, sequence of (folder of the bag, report))
         What came of each variant.
+    common : sequence of str
+        Assignments that all variants share.
 
     Returns
     -------
     list of str
         The table, for a terminal.
     """
+    clouds = [_first_cloud(found) for _, found in results]
     rows = [
-        {"settings": list(v.assignments), **_row([r for _, r in found])} for v, found in results
+        {
+            "settings": list(v.assignments),
+            **_row([r for _, r in found]),
+            "z_off_first_m": _scatter_m(clouds[0], cloud),
+        }
+        for (v, found), cloud in zip(results, clouds, strict=True)
     ]
-    write_json(output / "sweep.json", {"format": 1, "variants": rows})
+    write_json(output / "sweep.json", {"format": 1, "common": list(common), "variants": rows})
     titles = [variant.title for variant, _ in results]
     cells = [_cells(row) for row in rows]
     pictures = [_pictures(found) for _, found in results]
-    write_text(output / "sweep.html", page("Sweep", _parts(titles, cells, pictures)))
+    write_text(output / "sweep.html", page("Sweep", _parts(titles, cells, pictures, common)))
     width = max(len(title) for title in [*titles, "settings"])
     lines = [f"{'settings':<{width}}" + "".join(f"{c:>16}" for c in COLUMNS)]
     return lines + [
@@ -114,6 +130,23 @@ def _row(reports: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
+def _first_cloud(found: Sequence[tuple[Path, Mapping[str, Any]]]) -> Path | None:
+    """Organised cloud of the first scan, where it gave one."""
+    files = [folder / report["folder"] / "cloud.pcd" for folder, report in found[:1]]
+    return next((file for file in files if file.is_file()), None)
+
+
+def _scatter_m(first: Path | None, other: Path | None) -> float:
+    """How far two clouds of the same images differ in z: robust standard deviation, metres."""
+    if first is None or other is None:
+        return float("nan")
+    here, there = read_cloud(first)["z"], read_cloud(other)["z"]
+    if here.shape != there.shape:
+        return float("nan")
+    apart = (there - here)[np.isfinite(there - here)]
+    return float(MAD * np.median(np.abs(apart))) if apart.size else float("nan")
+
+
 def _middle(values: Sequence[float]) -> float:
     there = [v for v in values if np.isfinite(v)]
     return float(np.median(there)) if there else float("nan")
@@ -131,6 +164,7 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
         micrometres(row["median_sigma_m"]),
         told(row["bound_ratio"], "{:.3f}"),
         micrometres(row["plane_rms_m"]),
+        micrometres(row["z_off_first_m"]) if np.isfinite(row["z_off_first_m"]) else "-",
     ]
 
 
@@ -144,7 +178,10 @@ def _pictures(found: Sequence[tuple[Path, Mapping[str, Any]]]) -> list[bytes]:
 
 
 def _parts(
-    titles: Sequence[str], cells: Sequence[Sequence[str]], pictures: Sequence[Sequence[bytes]]
+    titles: Sequence[str],
+    cells: Sequence[Sequence[str]],
+    pictures: Sequence[Sequence[bytes]],
+    common: Sequence[str],
 ) -> list[str]:
     """The page: the table, then each variant's pictures."""
     head = "".join(f"<th>{html.escape(name)}</th>" for name in ("settings", *COLUMNS))
@@ -155,7 +192,10 @@ def _parts(
         for title, row in zip(titles, cells, strict=True)
     )
     parts = ["<h1>Sweep</h1>", f"<table><tr>{head}</tr>{rows}</table>",
-             "<p>Medians over the scans of each variant.</p>"]  # fmt: skip
+             "<p>Medians over the scans of each variant; z off first: scatter of z about that of "
+             "the first variant, at the points of the first scan that both have.</p>"]  # fmt: skip
+    if common:
+        parts.append(f"<p>All with {html.escape(', '.join(common))}.</p>")
     for title, shown in zip(titles, pictures, strict=True):
         parts.append(f"<h2>{html.escape(title)}</h2>")
         parts += [
