@@ -14,6 +14,7 @@ files than after the first scans. Memory is reported. The exit status is 0 when 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import random
@@ -43,7 +44,7 @@ from sl_projector.sequence import named
 NODES = ("projector", "camera", "stage", "synchronizer", "calibration", "reconstruct")
 READY_S = 900.0
 #: So long all nodes may take to be well again; longest is a projector that does not answer at all.
-RECOVERY_S = 60.0
+RECOVERY_S = 120.0
 #: A scan that is not answered for so long is counted as silent.
 ANSWER_S = 180.0
 #: A cloud is wrong when more than this part of its points is further from the clean cloud than
@@ -215,7 +216,23 @@ class Client:
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_health, 50)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
-        threading.Thread(target=self._executor.spin, daemon=True).start()
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        from rclpy.executors import ExternalShutdownException
+
+        with contextlib.suppress(ExternalShutdownException):
+            self._executor.spin()
+
+    def close(self) -> None:
+        """Leave the graph."""
+        import rclpy
+
+        self._executor.shutdown()
+        rclpy.try_shutdown()
+        self._thread.join(10.0)
+        self._node.destroy_node()
 
     def _on_cloud(self, message: Any) -> None:
         from sl_reconstruct.messages import cloud_from_msg
@@ -528,8 +545,8 @@ def soak(arguments: argparse.Namespace, options: GraphOptions) -> dict[str, Any]
     os.environ.update(options.transport.environment())
     draw = random.Random(arguments.seed)
     began_s = time.monotonic()
-    with BenchControl(options.directory) as control:
-        run = Soak(Client(), control, options.directory, arguments.keep)
+    with BenchControl(options.directory) as control, contextlib.closing(Client()) as client:
+        run = Soak(client, control, options.directory, arguments.keep)
         run.learn(arguments.sequences.split(","))
         ended = threading.Event()
         signal.signal(signal.SIGINT, lambda *_: ended.set())  # the figures so far are told

@@ -19,6 +19,7 @@ from domains import ReservedDomain
 from sl_bringup.graph_config import NODES
 from sl_bringup.transport import process_environment
 
+SOAK = Path(__file__).parent.parent / "benchmarks" / "soak_faults.py"
 SLRIG = (sys.executable, "-m", "sl_bringup.cli")
 #: The first start on a machine compiles for a minute or two.
 READY_PATIENCE_S = 280.0
@@ -109,6 +110,25 @@ def test_a_sequence_that_does_not_exist_is_refused(graph: Command, tmp_path: Pat
     assert not report["good"]
     assert "zebra" in told
     assert not (tmp_path / "cloud.ply").exists()
+
+
+def test_scans_with_devices_that_fail_at_random(graph: Command, ros_domain: int) -> None:
+    """A taste of ``benchmarks/soak_faults.py``: no wrong cloud, no dead node, all well again.
+
+    The seed has a late, a lost and an ill-sized frame, serial noise, an unplugged projector, a
+    stale reply, a refused command, and a scan without a fault.
+    """
+    soak = subprocess.run(
+        [sys.executable, str(SOAK), "--attach", "--domain", f"{ros_domain}", "--scans", "8",
+         "--seed", "64", "--sequences", "paper"],
+        env=process_environment({"PYTHONPATH": os.pathsep.join(sys.path)}),
+        capture_output=True, text=True, timeout=600.0, check=False,
+    )  # fmt: skip
+    assert soak.returncode == 0, soak.stdout + soak.stderr
+    figures = json.loads(soak.stdout[soak.stdout.index("{") :])
+    assert figures["scans"] == 8
+    assert not figures["defects"]
+    assert figures["totals"]["refused"] < 8
 
 
 def test_a_node_that_is_killed_comes_back_and_scans_go_on(graph: Command, tmp_path: Path) -> None:
