@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sl_bench.camera_emulator import CameraEmulator, Exposure
+from sl_bench.camera_emulator import GIVEN_UP_S, CameraEmulator, Exposure
 from sl_bench.camera_faults import CameraFaults
 from sl_camera import camera_protocol as wire
 from sl_camera.camera import CameraSettings, Frame, FrameStatus
@@ -30,10 +31,12 @@ class Wiring:
     def __init__(self, directory: Path) -> None:
         self.exposures: list[Exposure] = []
         self.stage_m = (0.0, 0.0, 0.0)
+        self.renderer = self.render
         self.path = directory / "camera.sock"
         self.emulator = CameraEmulator(
-            self.path, self.render, (WIDTH, HEIGHT), stage_m=lambda: self.stage_m,
-            mirrors_now=lambda: MIRRORS, max_rate_hz=200.0, readout_s=0.0005,
+            self.path, lambda exposure: self.renderer(exposure), (WIDTH, HEIGHT),
+            stage_m=lambda: self.stage_m, mirrors_now=lambda: MIRRORS, max_rate_hz=200.0,
+            readout_s=0.0005,
         )  # fmt: skip
         self.camera = SocketCamera(self.path)
 
@@ -155,6 +158,24 @@ def test_frames_of_before_are_gone_after_arm(wiring: Wiring) -> None:
     wiring.camera.arm()
     (stamp_ns,) = wiring.edges(1)
     assert [f.stamp_ns for f, _ in wiring.read(5, 0.5)] == [stamp_ns]
+
+
+def test_frames_far_behind_are_given_up_when_another_sequence_begins(wiring: Wiring) -> None:
+    rendering, go_on = threading.Event(), threading.Event()
+
+    def render(exposure: Exposure) -> np.ndarray:  # type: ignore[type-arg]
+        rendering.set()
+        assert go_on.wait(15.0)
+        return Wiring.render(wiring, exposure)
+
+    wiring.renderer = render
+    long_ago_ns = time.time_ns() - round(2 * GIVEN_UP_S * 1e9)
+    first = wiring.edges(5, long_ago_ns)
+    assert rendering.wait(15.0)
+    second = wiring.edges(3, long_ago_ns + 10**9)
+    go_on.set()
+    assert [f.stamp_ns for f, _ in wiring.read(8)] == [first[0], *second]
+    assert wiring.emulator.frames_given_up == 4
 
 
 def test_software_trigger_sees_what_the_dmd_shows(wiring: Wiring) -> None:

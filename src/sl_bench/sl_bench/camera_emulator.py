@@ -33,6 +33,9 @@ Position = tuple[float, float, float]
 SWAP_WAIT_S = 0.3
 #: An edge may come so much (as a fraction) before the camera is ready again: clocks are not exact.
 READY_SLACK = 0.005
+#: Frames of an earlier sequence that are so late are not rendered: who began another has given
+#: them up. A slow machine would else be busy with them for ever, and late again with the next.
+GIVEN_UP_S = 5.0
 #: Exposures of the DMD that are remembered, to integrate over.
 HISTORY = 256
 
@@ -142,6 +145,7 @@ class CameraEmulator:
     ) -> None:
         self.faults = CameraFaults()
         self.edges_lost = 0
+        self.frames_given_up = 0
         self._render = render
         self._image_size = image_size
         self._stage_m = stage_m
@@ -153,6 +157,7 @@ class CameraEmulator:
         self._armed = False
         self._generation = 0
         self._last_start_ns = 0
+        self._sequence_ns = 0
         self._frame_ids = itertools.count(1)
         self._frames_taken = 0
         self._lock = threading.RLock()
@@ -199,6 +204,7 @@ class CameraEmulator:
             "trigger": self._settings.trigger,
             "frames_taken": self._frames_taken,
             "edges_lost": self.edges_lost,
+            "frames_given_up": self.frames_given_up,
         }
 
     # -- commands ---------------------------------------------------------------------------
@@ -253,6 +259,8 @@ class CameraEmulator:
         """Take the DMD's trigger edge; quick, called from the DMD's thread at the edge."""
         if not self._shown or self._shown[-1][0] != start_ns:  # a doubled edge is no more light
             self._shown.append((start_ns, exposure_s, mirrors))
+        if index == 0:
+            self._sequence_ns = start_ns
         if self._settings.trigger == "hardware":
             self._expose(start_ns)
 
@@ -303,8 +311,14 @@ class CameraEmulator:
                 job = self._rendering.get(timeout=0.05)
             except queue.Empty:
                 continue
-            if job.generation == self._generation:
+            if job.generation == self._generation and not self._given_up(job):
                 self._post(job, self._image(job))
+
+    def _given_up(self, job: _Job) -> bool:
+        late_s = (time.time_ns() - job.end_ns) * 1e-9
+        given_up = job.start_ns < self._sequence_ns and late_s > GIVEN_UP_S
+        self.frames_given_up += given_up
+        return given_up
 
     def _image(self, job: _Job) -> NDArray[Any]:
         exposure = Exposure(
