@@ -28,6 +28,7 @@ from sl_bringup.bags import (  # noqa: E402
     MATCHING,
     PROJECTOR_INFO,
     RECORDED_TOPICS,
+    REPORT,
     SETTINGS,
     open_bag,
 )
@@ -60,7 +61,7 @@ def live(tmp_path_factory: pytest.TempPathFactory, ros_domain: int) -> Iterator[
         for name in ("whole", "killed"):
             output = str(folder / name)
             commands.append(Command("record", "--output", output, "--domain", domain))
-            commands[-1].wait_for("recording to", 30.0)
+            commands[-1].wait_for("recording to", 60.0)
         time.sleep(DISCOVERY_S)
         hashes = []
         for number in range(SCANS):
@@ -69,7 +70,7 @@ def live(tmp_path_factory: pytest.TempPathFactory, ros_domain: int) -> Iterator[
             scan = Command("scan", *arguments, "--domain", domain)
             assert scan.end(patience_s=120.0) == 0, scan.text
             hashes.append(json.loads((out / "report.json").read_text())["cloud_hash"])
-        time.sleep(1.0)
+        wait(lambda: reports_in(folder / "killed") == SCANS, "the last report", 60.0)
         _, whole, killed = commands
         killed.end(signal.SIGKILL)
         assert whole.end(signal.SIGINT) == 0, whole.text
@@ -78,6 +79,12 @@ def live(tmp_path_factory: pytest.TempPathFactory, ros_domain: int) -> Iterator[
         for command in commands[1:]:
             command.end(signal.SIGKILL)
         up.end(signal.SIGINT)
+
+
+def reports_in(bag: Path) -> int:
+    """Reports that a recorder has handed over so far: they come after all else of a scan."""
+    with open_bag(bag) as opened:
+        return len(list(opened.messages(REPORT)))
 
 
 def evaluated(bag: Path, output: Path) -> list[str]:
