@@ -16,7 +16,6 @@ from sl_projector.errors import CalibrationError
 from sl_reconstruct.calibration_file import load_rig
 from sl_reconstruct.rig import BrownConrady, Device
 
-BOARD = Path(__file__).parents[2] / "shared" / "data" / "procam_board"
 POINTS_M = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * [5e-3, 4e-3, 1e-3]
 
 
@@ -109,51 +108,3 @@ def test_free_poses_are_refused_where_there_are_too_few() -> None:
         solve_free([TARGET_M] * 3, seen, PROJECTOR, 3)
     with pytest.raises(CalibrationError, match="shapes"):
         solve_free([TARGET_M] * 3, seen, PROJECTOR)
-
-
-# -- somebody else's chessboard -------------------------------------------------------------------
-
-
-def gray_code(stack: np.ndarray) -> np.ndarray:
-    """Integers (H, W) of ten (pattern, inverse) pairs, most significant bit first."""
-    bits = np.logical_xor.accumulate(stack[0::2] > stack[1::2], axis=0)
-    return sum((bits[i].astype(np.int16) << (9 - i) for i in range(10)), np.int16(0))
-
-
-def board_view(capture: int) -> tuple[np.ndarray, np.ndarray]:
-    """Chessboard corners in camera pixels, and the DMD coordinates there, by local homographies."""
-    files = [BOARD / f"capture_{capture}" / f"graycode_{i:02d}.png" for i in range(42)]
-    stack = np.stack([cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files])
-    mean = stack[:40].mean(
-        axis=0, dtype=np.float32
-    )  # every pattern and its inverse: evenly lit, and less noise
-    image = (255 * mean / mean.max()).astype(np.uint8)
-    found, corners = cv2.findChessboardCornersSB(image, (9, 7), flags=cv2.CALIB_CB_ACCURACY)
-    assert found
-    corners = corners.reshape(-1, 2).astype(float)
-    dmd = np.stack([gray_code(stack[0:20]), gray_code(stack[20:40])], axis=-1).astype(float)
-    lit = cv2.subtract(stack[40], stack[41]) > 20
-    thrown = []
-    for corner in corners:
-        u, v = np.round(corner).astype(int)[:, None, None] + 2 * np.mgrid[-20:21, -20:21]
-        near = np.stack([u, v], axis=-1)[lit[v, u]].astype(float)
-        # codes are whole mirrors, and a wrong bit is far off: the rest average to sub-mirrors
-        matrix, _ = cv2.findHomography(near, dmd[v, u][lit[v, u]], cv2.RANSAC, 2.0, maxIters=300)
-        thrown.append(cv2.perspectiveTransform(corner[None, None], matrix)[0, 0])
-    return corners, np.array(thrown)
-
-
-@pytest.mark.skipif(not BOARD.is_dir(), reason="no ../shared/data/procam_board beside the project")
-def test_procam_board() -> None:
-    """The issue's figure: stereo rms at most 0.30 px with k1, k2 (the data's README: 0.266)."""
-    views = [board_view(capture) for capture in range(3)]
-    x, y = np.meshgrid(np.arange(9) * 0.075, np.arange(7) * 0.075)
-    board = np.stack([x.ravel(), y.ravel()], axis=1)
-    sensors = (Sensor((1280, 1024), 5e-6), Sensor((1024, 768), 1e-5))
-    pair = solve_free_pair([board] * 3, [v[0] for v in views], [v[1] for v in views], sensors)
-    assert pair.rms_px <= 0.30
-    published = load_rig(BOARD / "calibration.json", (1280, 1024), (1024, 768))
-    for found, true in (
-        (pair.rig.camera, published.camera), (pair.rig.projector, published.projector)
-    ):  # fmt: skip
-        assert found.focal_length_px[0] == pytest.approx(true.focal_length_px[0], rel=0.01)

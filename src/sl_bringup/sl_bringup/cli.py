@@ -21,6 +21,7 @@ COMMANDS: tuple[tuple[str, str, str], ...] = (
     ("up", "sl_bringup.up", "start the node graph and supervise it"),
     ("scan", "sl_bringup.scan", "scan the part: cloud, height map, pictures"),
     ("calibrate", "sl_bringup.calibrate", "calibrate the rig on the hole plate, with a verdict"),
+    ("board", "sl_bringup.board", "calibrate from a chessboard held anyhow"),
     ("doctor", "sl_bringup.doctor", "say what is missing on this machine, and what to do"),
     ("patterns", "sl_bringup.patterns", "write a sequence's file and its frames as PNG"),
     ("import", "sl_bringup.importer", "make a recording of a folder of images"),

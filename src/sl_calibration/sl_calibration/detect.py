@@ -33,7 +33,7 @@ MIN_CHAMFER_PX = 1.5
 #: Sigma of a centre before its noise is looked at.
 ROUGH_SIGMA_PX = 0.02
 #: Added in quadrature to sigma: what the model of a blurred step leaves on clean images.
-MODEL_SIGMA_PX = 0.0003
+MODEL_SIGMA_PX = 0.0004
 #: Sigma of a centre whose surroundings are all at the top of the scale, px: light that changes by
 #: 10 % across the hole moves a clipped edge of 1 px blur by about this much.
 SATURATED_SIGMA_PX = 0.03

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,10 @@ MIN_LIGHT = 0.05
 MIN_LIT_PART = 0.02
 #: Fewer targets than this in a view do not carry a projector's calibration.
 MIN_TARGETS = 30
+#: Added in quadrature to a target's sigma, DMD pixels. Light that falls by 1e-4 a pixel and the
+#: camera's slant move the edges by 1e-4 px, alike over whole regions of the field: such errors do
+#: not average out, and each of the hundreds of targets has to count for less to make up for it.
+MODEL_SIGMA_PX = 0.001
 _NO_TARGETS = Correspondences(*np.empty((3, 0, 2)))
 
 
@@ -54,7 +59,7 @@ def _targets(taken: Taken) -> Correspondences:
             f"the projector's coordinates were decoded at {len(found)} places; expected at least "
             f"{MIN_TARGETS}: is the plate in focus and evenly lit, and the exposure right?"
         )
-    return found
+    return replace(found, sigma_px=np.hypot(found.sigma_px, MODEL_SIGMA_PX))
 
 
 def white_image(stack: NDArray[Any], sequence: PatternSequence) -> NDArray[np.float32]:
