@@ -9,6 +9,9 @@ near ties they are spread by the noise already.
 
 from __future__ import annotations
 
+import functools
+import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,13 +20,29 @@ from scipy import fft, ndimage
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Axes = tuple[int, ...]
+#: Noisy heights on a grid to the surface, and the part of the noise's variance left in it.
+Estimate = Callable[[Array], tuple[Array, float]]
 
-#: A mean over a window counts as the surface where it agrees with all smaller windows' so well.
-AGREES_SD = 3.0
+#: A mean over a window counts as the surface where it agrees with all smaller windows': within so
+#: many standard deviations more than the largest of all points' noise.
+AGREES_SD = 0.5
 #: A band of coefficients holds surface when its power exceeds the noise's by so many deviations.
-BAND_SD = 2.0
+BAND_SD = 3.0
+#: Draws of noise for a bias, to know its spectrum, and to repeat the estimate.
+DRAWS, FEW, REPEATS = 200, 16, 24
+#: Of the polynomial that is taken out before cosines.
+DEGREE = 4
 #: Coefficients of one band.
 BAND = 64
+
+
+class Level(NamedTuple):
+    """Windows of one reach: standard deviations of their means by noise, and their points."""
+
+    reach: int
+    sd: Array
+    points: Array
 
 
 class Corrected(NamedTuple):
@@ -55,7 +74,7 @@ def take_off(raw: float, clean: float, drawn: Array, squares: bool = False) -> C
     return Corrected(value, float(again.std(ddof=1)))
 
 
-def peak_to_valley(heights: Array, noise_sd: Array, there: Mask, draws: int = 400) -> Corrected:
+def peak_to_valley(heights: Array, noise_sd: Array, there: Mask) -> Corrected:
     """Highest less lowest of a surface of which noisy heights are known.
 
     Parameters
@@ -64,8 +83,6 @@ def peak_to_valley(heights: Array, noise_sd: Array, there: Mask, draws: int = 40
         Heights on a grid and the standard deviations of their independent noise.
     there : ndarray of bool
         Where they count.
-    draws : int
-        Repetitions of the noise; seeded.
 
     Returns
     -------
@@ -73,16 +90,14 @@ def peak_to_valley(heights: Array, noise_sd: Array, there: Mask, draws: int = 40
         Of a surface without form it scatters about 0 and may be negative.
     """
     filled, sd = (fill(np.where(there, a, np.nan)) for a in (heights, noise_sd))
-    rng = np.random.default_rng(0)
-    clean = estimate(filled, sd * rng.standard_normal((16, *sd.shape)))
-    clean = clean[there]
-    noise = rng.standard_normal((draws, clean.size)) * sd[there]
-    drawn = np.ptp(clean + noise, axis=1)
-    return take_off(float(np.ptp(heights[there])), float(np.ptp(clean)), drawn)
+    noise = sd * np.random.default_rng(0).standard_normal((DRAWS, *sd.shape))
+    return extremes(filled, noise, choose(filled, noise), there)[2]
 
 
-def estimate(heights: Array, noise: Array) -> Array:
-    """Estimate the surface under noisy heights, from waves or from windows, whichever needs less.
+def extremes(
+    heights: Array, noise: Array, estimate: Estimate, there: Mask
+) -> tuple[Corrected, Corrected, Corrected]:
+    """Highest, minus the lowest, and highest less lowest height, less what noise adds.
 
     Parameters
     ----------
@@ -90,15 +105,38 @@ def estimate(heights: Array, noise: Array) -> Array:
         On a grid, none missing.
     noise : ndarray, (n, *shape)
         Draws of noise alone.
+    estimate : callable
+        Surface without noise.
+    there : ndarray of bool
+        Where heights count.
 
-    Returns
-    -------
-    ndarray
-        Shape of the heights. Waves suit what is smooth or repeats, windows suit plateaus and
-        steps; the fewer numbers one of them needs to tell the surface, the less noise is in it.
+    Notes
+    -----
+    Noise that is left in the estimate hides a part of the bias: none where the bias grows with
+    the square of the noise (one peak, rounded off), and 1 - (sqrt(1 + left) - sqrt(left)) where
+    it grows with the noise (near ties). The middle is taken off. The uncertainty is the scatter
+    of the whole estimate, repeated on the estimated surface (double bootstrap).
     """
-    waves, windows = _by_waves(heights, noise), _by_windows(heights, noise)
-    return waves[0] if waves[1] <= windows[1] else windows[0]
+    alone = noise[:, there]
+
+    def corrected(measured: Array) -> Array:
+        clean, left = estimate(measured)
+        bias = _tops(clean[there] + alone).mean(axis=0) - _tops(clean[there])
+        hidden = bias * (1.0 / (np.sqrt(1.0 + left) - np.sqrt(left)) - 1.0)
+        return np.asarray(_tops(measured[there]) - bias - 0.5 * hidden)
+
+    values = corrected(heights)
+    clean = estimate(heights)[0]
+    repeated = np.stack([corrected(clean + draw) for draw in noise[:REPEATS]])
+    spread = repeated.std(axis=0, ddof=1)
+    peak, valley, total = map(Corrected, values.tolist(), spread.tolist())
+    return peak, valley, total
+
+
+def _tops(heights: Array) -> Array:
+    """Highest, minus lowest, and their sum along the last axis."""
+    high, low = heights.max(axis=-1), -heights.min(axis=-1)
+    return np.stack([high, low, high + low], axis=-1)
 
 
 def fill(heights: Array) -> Array:
@@ -110,65 +148,145 @@ def fill(heights: Array) -> Array:
     return np.asarray(heights[tuple(nearest)])
 
 
-def _by_waves(heights: Array, noise: Array) -> tuple[Array, float]:
-    """Cosine transform; coefficients keep the part of their power that is not noise.
+class Waves:
+    """Estimates a surface by its cosine transform: coefficients keep what is not noise of them.
 
     Those above the universal threshold (Donoho and Johnstone, Biometrika 81, 1994) speak for
-    themselves, of the others only the power of a band is known. Also the numbers it took.
+    themselves, of the others only the power of a band is known. A polynomial is taken out before:
+    cosines end flat, and would round off the corners of a bow. Suits what is smooth or repeats.
+
+    Parameters
+    ----------
+    noise : ndarray, (n, *shape)
+        Draws of noise alone.
     """
-    axes = tuple(range(1, noise.ndim))
-    c = fft.dctn(heights, norm="ortho")
-    power = ndimage.uniform_filter(np.mean(fft.dctn(noise, norm="ortho", axes=axes) ** 2, 0), 5)
-    power = np.maximum(power, np.finfo(np.float64).tiny)
-    over = (c**2 / power).ravel()  # in units of the noise
-    kept = over > 2.0 * np.log(max(over.size, 2))
-    share = np.where(kept, 1.0 - 1.0 / np.maximum(over, 1.0), 0.0)
-    order = np.argsort(_frequency(heights.shape).ravel(), kind="stable")
-    rest = order[~kept[order]]
-    for band in np.array_split(rest, max(1, len(rest) // BAND)):
-        excess = float(over[band].mean()) - 1.0 if len(band) else 0.0
-        if excess > BAND_SD * np.sqrt(2.0 / max(len(band), 1)):
-            share[band] = excess / (1.0 + excess)
-    mean = fft.idctn(c * np.sqrt(share).reshape(c.shape), norm="ortho")
-    return np.asarray(mean), float(share.sum())
+
+    def __init__(self, noise: Array) -> None:
+        axes = tuple(range(1, noise.ndim))
+        power = np.mean(fft.dctn(noise[:FEW], norm="ortho", axes=axes) ** 2, axis=0)
+        self._power = np.maximum(ndimage.uniform_filter(power, 5), np.finfo(np.float64).tiny)
+        parts = np.meshgrid(*(np.arange(n) / n for n in power.shape), indexing="ij")
+        self._order = np.argsort(sum(part**2 for part in parts).ravel(), kind="stable")
+        self._form = _polynomials(power.shape)
+
+    def __call__(self, heights: Array) -> tuple[Array, float]:
+        """Surface, and the part of the noise's variance that is left in it."""
+        form = (self._form @ (heights.ravel() @ self._form)).reshape(heights.shape)
+        c = fft.dctn(heights - form, norm="ortho")
+        over = (c**2 / self._power).ravel()  # in units of the noise
+        kept = over > 2.0 * np.log(max(over.size, 2))
+        share = np.where(kept, 1.0 - 1.0 / np.maximum(over, 1.0), 0.0)
+        rest = self._order[~kept[self._order]]
+        for band in np.array_split(rest, max(1, len(rest) // BAND)):
+            excess = float(over[band].mean()) - 1.0 if len(band) else 0.0
+            if excess > BAND_SD * np.sqrt(2.0 / max(len(band), 1)):
+                share[band] = excess / (1.0 + excess)
+        surface = form + fft.idctn(c * np.sqrt(share).reshape(c.shape), norm="ortho")
+        return surface, float(share.mean()) + self._form.shape[1] / heights.size
 
 
-def _frequency(shape: tuple[int, ...]) -> Array:
-    parts = np.meshgrid(*(np.arange(n) / n for n in shape), indexing="ij")
-    return np.sqrt(sum(part**2 for part in parts))
+class Windows:
+    """Estimates a surface by means over the largest windows that agree with all smaller ones.
 
+    Lepski's method. Windows are square or along one axis, about the point or beside it, so that
+    they fill plateaus and ridges up to the edge. Suits plateaus and steps.
 
-def _by_windows(heights: Array, noise: Array) -> tuple[Array, float]:
-    """Means over the largest windows that agree with all smaller ones (Lepski's method).
-
-    Also the numbers it took: the sum of one over the points of each window.
+    Parameters
+    ----------
+    noise : ndarray, (n, *shape)
+        Draws of noise alone.
     """
-    found, lower, upper = heights.copy(), np.full(heights.shape, -np.inf), np.full(
-        heights.shape, np.inf)  # fmt: skip
-    growing = np.ones(heights.shape, np.bool_)
-    numbers = np.ones(heights.shape)
-    size = 1
-    while size < 2 * max(heights.shape):
-        mean, count = _window(heights, size), _window(np.ones(heights.shape), size, total=True)
-        variance = np.mean([_window(draw, size) ** 2 for draw in noise], axis=0)
-        sd = np.sqrt(_window(variance, size))
-        growing &= (mean >= lower) & (mean <= upper)
-        if not growing.any():
-            break
-        found[growing], numbers[growing] = mean[growing], 1.0 / count[growing]
-        lower = np.maximum(lower, mean - AGREES_SD * sd)
-        upper = np.minimum(upper, mean + AGREES_SD * sd)
-        size = 2 * size + 1
-    return found, float(numbers.sum())
+
+    def __init__(self, noise: Array) -> None:
+        shape, every = noise.shape[1:], tuple(range(noise.ndim - 1))
+        self._limit = np.sqrt(2.0 * np.log(noise[0].size)) + AGREES_SD
+        self._kinds = [
+            (axes, _levels(noise[:FEW], axes))
+            for axes in (every, *((axis,) for axis in every if len(every) > 1))
+        ]
+        self._shape = shape
+
+    def __call__(self, heights: Array) -> tuple[Array, float]:
+        """Surface, and the part of the noise's variance that is left in it."""
+        found, points = heights.copy(), np.ones(heights.shape)
+        for axes, levels in self._kinds:
+            means = [_window(heights, level.reach, axes) for level in levels]
+            for sides in itertools.product((-1, 0, 1), repeat=len(axes)):
+                mean, count = self._largest(means, levels, axes, sides)
+                more = count > points
+                found[more], points[more] = mean[more], count[more]
+        return found, float(np.mean(1.0 / points))
+
+    def _largest(
+        self, means: list[Array], levels: list[Level], axes: Axes, sides: Axes
+    ) -> tuple[Array, Array]:
+        """Means over the largest windows on one side, and their points."""
+        found, points = means[0].copy(), np.ones(self._shape)
+        lower, upper = np.full(self._shape, -np.inf), np.full(self._shape, np.inf)
+        growing = np.ones(self._shape, np.bool_)
+        for level, every in zip(levels, means, strict=True):
+            at = _beside(self._shape, axes, sides, level.reach)
+            mean, margin, count = every[at], self._limit * level.sd[at], level.points[at]
+            growing &= (mean >= lower) & (mean <= upper)
+            found[growing], points[growing] = mean[growing], count[growing]
+            lower, upper = np.maximum(lower, mean - margin), np.minimum(upper, mean + margin)
+        return found, points
 
 
-def _window(values: Array, size: int, total: bool = False) -> Array:
-    """Means, or sums, over windows of a side, cut off at the border."""
-    sums = values
-    shares = np.ones(values.shape)
-    for axis, n in enumerate(values.shape):
-        reach = min(size // 2, n - 1)
-        length = 2 * reach + 1
-        sums = ndimage.uniform_filter1d(sums, length, axis, mode="constant") * length
-        shares = ndimage.uniform_filter1d(shares, length, axis, mode="constant") * length
-    return np.asarray(sums if total else sums / shares)
+def choose(heights: Array, noise: Array) -> Estimate:
+    """Waves or windows, whichever is nearer to the surface of these heights.
+
+    By Stein's unbiased estimate of the squared error (Annals of Statistics 9, 1981).
+    """
+    variance = np.mean(noise**2, axis=0)
+
+    def error(way: Estimate) -> float:
+        surface, left = way(heights)
+        return float(np.mean((heights - surface) ** 2 / variance)) + 2.0 * left
+
+    waves, windows = Waves(noise), Windows(noise)
+    return waves if error(waves) <= error(windows) else windows
+
+
+def _polynomials(shape: tuple[int, ...]) -> Array:
+    """Orthonormal columns (points, terms): polynomials up to a degree of all axes together."""
+    lines = [np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, n), min(DEGREE, n - 1))
+             for n in shape]  # fmt: skip
+    terms = itertools.product(*(range(line.shape[1]) for line in lines))
+    chosen = [term for term in terms if sum(term) <= DEGREE]
+    lines_of = [[line[:, k] for line, k in zip(lines, term, strict=True)] for term in chosen]
+    columns = [functools.reduce(np.multiply.outer, each) for each in lines_of]
+    return np.linalg.qr(np.stack([column.ravel() for column in columns], axis=1))[0]
+
+
+def _levels(noise: Array, axes: Axes) -> list[Level]:
+    """Windows from the smallest to the largest, and what noise does to their means."""
+    shape, levels, reach = noise.shape[1:], [], 0
+    while reach == 0 or 2 * reach < max(shape[axis] for axis in axes):
+        variance = np.mean([_window(draw, reach, axes) ** 2 for draw in noise], axis=0)
+        sd = np.sqrt(_window(variance, reach, axes))
+        levels.append(Level(reach, sd, _sums(np.ones(shape), reach, axes)))
+        reach = 2 * reach + 1
+    return levels
+
+
+def _beside(
+    shape: tuple[int, ...], axes: Axes, sides: Axes, reach: int
+) -> tuple[NDArray[np.int64], ...]:
+    """Indices of the centres of windows that lie beside every point and still hold it."""
+    lines = [np.arange(n) for n in shape]
+    for axis, side in zip(axes, sides, strict=True):
+        lines[axis] = np.clip(lines[axis] + side * reach, 0, shape[axis] - 1)
+    return np.ix_(*lines)
+
+
+def _window(values: Array, reach: int, axes: Axes) -> Array:
+    """Means over windows, cut off at the border."""
+    return _sums(values, reach, axes) / _sums(np.ones(values.shape), reach, axes)
+
+
+def _sums(values: Array, reach: int, axes: Axes) -> Array:
+    for axis in axes:
+        length = 2 * min(reach, values.shape[axis] - 1) + 1
+        values = length * ndimage.uniform_filter1d(values, length, axis, mode="constant")
+    return values

@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from sl_projector.errors import ConfigError, StackError
 from sl_reconstruct.height_map import HeightMap, make_height_map
-from sl_reconstruct.measure.denoise import Corrected, estimate, fill, take_off
+from sl_reconstruct.measure.denoise import (
+    Corrected,
+    Waves,
+    extremes,
+    fill,
+    take_off,
+)
 from sl_reconstruct.measure.region import Region
 from sl_reconstruct.measure.result import Measurement, Quantity
 
@@ -24,7 +30,8 @@ Array = NDArray[np.float64]
 LENGTHS = ("Sa", "Sq", "Sp", "Sv", "Sz")
 NUMBERS = ("Ssk", "Sku", "Sdr", "Sdq")
 #: Parameters to which noise adds as variances do.
-SQUARES = ("Sa", "Sq", "Sp", "Sv", "Sz", "Sdq")
+SQUARES = ("Sa", "Sq", "Sdq")
+EXTREMES = ("Sp", "Sv", "Sz")
 #: Repetitions of the points' noise that tell bias and uncertainty.
 DRAWS = 48
 MICROMETRE_M = 1e-6
@@ -191,14 +198,28 @@ def _corrected(
         return {name: Corrected(value, float("nan")) for name, value in raw.items()}
     noise = _noise_maps(points, sigma, height)
     inner = _levelled(fill(_without_border(np.asarray(height.z_m, dtype=np.float64))))
-    clean = estimate(inner, noise)
+    estimate = Waves(noise)
+    clean = estimate(inner)[0]
     told = areal_parameters(clean, height.step_m)
     drawn = [areal_parameters(clean + draw, height.step_m) for draw in noise]
-    return {
+    found = {
         name: take_off(raw[name], told[name], np.array([one[name] for one in drawn]),
                        name in SQUARES)
         for name in raw
     }  # fmt: skip
+    # Highest and lowest of levelled heights are Sp and Sv themselves.
+    level = np.stack([_levelled(draw) for draw in noise])
+    tops = extremes(inner, level, estimate, np.ones(inner.shape, np.bool_))
+    return found | dict(zip(EXTREMES, tops, strict=True)) | _shapes(raw, found)
+
+
+def _shapes(raw: dict[str, float], found: dict[str, Corrected]) -> dict[str, Corrected]:
+    """Ssk and Sku: third and fourth cumulant of normal noise are none, so only Sq changes."""
+    grown = raw["Sq"] / max(found["Sq"].value, 1e-3 * raw["Sq"])
+    return {
+        "Ssk": Corrected(raw["Ssk"] * grown**3, found["Ssk"].uncertainty * grown**3),
+        "Sku": Corrected(3.0 + (raw["Sku"] - 3.0) * grown**4, found["Sku"].uncertainty * grown**4),
+    }
 
 
 def _noise_maps(points: NDArray[Any], sigma: NDArray[Any], height: HeightMap) -> Array:
