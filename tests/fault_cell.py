@@ -46,7 +46,7 @@ from stage_bench import Clock
 PAPER = named("paper")
 PERIOD_S = 0.02
 #: Recovery is awaited, never timed; a loaded machine takes its time.
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 
 
 class Cell:
@@ -61,10 +61,10 @@ class Cell:
             readout_s=0.001,
         )  # fmt: skip
         self.dmd.on_exposure = self.camera.on_exposure
-        clock = Clock()
+        self.clock = Clock()
         self.stage: Any = (
-            GrblEmulator(clock=clock, homed=True, seed=3) if stage == "grbl"
-            else ZaberEmulator(clock=clock, homed=True, seed=3)
+            GrblEmulator(clock=self.clock, homed=True, seed=3) if stage == "grbl"
+            else ZaberEmulator(clock=self.clock, homed=True, seed=3)
         )  # fmt: skip
         self._port = str(folder / "stage")
         self._kind = stage
@@ -104,7 +104,7 @@ class Cell:
 
     def _make_stage(self) -> Any:
         if self._kind == "grbl":
-            return GrblStage(self._port, reply_timeout_s=0.5)
+            return GrblStage(self._port, reply_timeout_s=2.0)
         return ZaberStage(self._port, reply_timeout_s=0.3)
 
     def _render(self, exposure: Exposure) -> np.ndarray[Any, Any]:
@@ -198,6 +198,7 @@ class Cell:
             if not name.startswith("_"):
                 setattr(self.dmd.faults, name, value)
         self.usb.plug_in()
+        self.camera.disconnect(0.0)
 
 
 @contextmanager

@@ -112,14 +112,15 @@ class Graph:
         return client.call_async(request)
 
     def close(self) -> None:
-        """End everything, in the order of a clean shutdown."""
-        for node in list(self._nodes):
-            self.remove(node)
-        self.executor.remove_node(self.tester)
-        self.tester.destroy_node()
+        """End everything, in the order of a clean shutdown: no callback runs any more."""
         self.executor.shutdown()
-        self.context.try_shutdown()
         self._thread.join(timeout=10)
+        for node in self._nodes:
+            node.close()
+            node.destroy_node()
+        self._nodes.clear()
+        self.tester.destroy_node()
+        self.context.try_shutdown()
         self._reserved.release()
 
 

@@ -35,7 +35,7 @@ class Wiring:
         self.path = directory / "camera.sock"
         self.emulator = CameraEmulator(
             self.path, lambda exposure: self.renderer(exposure), (WIDTH, HEIGHT),
-            stage_m=lambda: self.stage_m, mirrors_now=lambda: MIRRORS, max_rate_hz=200.0,
+            stage_m=lambda _: self.stage_m, mirrors_now=lambda: MIRRORS, max_rate_hz=200.0,
             readout_s=0.0005,
         )  # fmt: skip
         self.camera = SocketCamera(self.path)

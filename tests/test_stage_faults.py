@@ -370,3 +370,19 @@ def test_the_operator_is_told_what_to_do_and_may_say_what_the_scales_say() -> No
     assert stage.position_m() == (0.00101, 0.0, -0.002)
     with pytest.raises(DeviceRefused, match="nothing to confirm"):
         stage.confirm()
+
+
+def test_the_emulator_remembers_where_the_carriage_stood(rig: Rig) -> None:
+    """So that a camera that is served late sees the part where it was, not where it went since."""
+    rig.clock.run_at(1.0)
+    before_ns = time.time_ns()
+    mover = Mover(rig.stage, 0.002, 0.0, 0.0)
+    assert mover.ended() is None
+    until(lambda: rig.emulator.position_at(time.time_ns())[0] == pytest.approx(0.002, abs=1e-9))
+    after_ns = time.time_ns()
+    assert rig.emulator.position_at(before_ns)[0] == 0.0
+    times_ns = [before_ns + i * (after_ns - before_ns) // 50 for i in range(51)]
+    places = [rig.emulator.position_at(at)[0] for at in times_ns]
+    assert places == sorted(places)
+    assert any(0.0 < place < 0.002 for place in places)
+    assert rig.emulator.position_at(after_ns + 10**9)[0] == pytest.approx(0.002, abs=1e-9)

@@ -79,7 +79,7 @@ class Bench:
             self._camera_endpoint(settings),
             self._render,
             rig.camera.image_size,
-            stage_m=self.stage.position_m,
+            stage_m=self.stage.position_at,
             mirrors_now=self.dmd.mirrors_now,
             max_rate_hz=settings.camera_frame_rate_hz,
             readout_s=settings.camera_readout_s,

@@ -121,7 +121,8 @@ class CameraEmulator:
     image_size : tuple of int
         (width, height) of the sensor, pixels.
     stage_m : callable
-        Where the stage stands now, metres.
+        ``stage_m(time_ns) -> position``: where the stage stood then, metres; host clock. A
+        shutter that is served late on a busy machine must not see where the stage went since.
     mirrors_now : callable
         What the DMD shows now, for frames that are not triggered by it.
     max_rate_hz : float
@@ -137,7 +138,7 @@ class CameraEmulator:
         endpoint: str | Path | Callable[[Execute], Endpoint],
         render: Render,
         image_size: tuple[int, int],
-        stage_m: Callable[[], Position] = lambda: (0.0, 0.0, 0.0),
+        stage_m: Callable[[int], Position] = lambda _: (0.0, 0.0, 0.0),
         mirrors_now: Callable[[], Mirrors | None] = lambda: None,
         max_rate_hz: float = 30.0,
         readout_s: float = 0.004,
@@ -279,7 +280,7 @@ class CameraEmulator:
             frame_id = next(self._frame_ids) & 0xFFFFFFFF
             settings, generation = self._settings, self._generation
             self._exposing.put(
-                _Job(frame_id, start_ns, settings, generation, faults, self._stage_m())
+                _Job(frame_id, start_ns, settings, generation, faults, self._stage_m(start_ns))
             )
 
     def _shutter_loop(self) -> None:
@@ -292,7 +293,7 @@ class CameraEmulator:
                     self._expose(time.time_ns())
                 continue
             self._stop.wait(max(0.0, (job.end_ns - time.time_ns()) * 1e-9))
-            end_m = self._stage_m()
+            end_m = self._stage_m(job.end_ns)
             x, y, z = ((a + b) / 2 for a, b in zip(job.stage_m, end_m, strict=True))
             job.stage_m = (x, y, z)
             self._rendering.put(job)

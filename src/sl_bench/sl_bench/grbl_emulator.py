@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -15,6 +16,14 @@ from types import TracebackType
 from sl_bench.grbl_firmware import STAGE_SETTINGS, GrblFirmware
 from sl_bench.grbl_motion import Triple
 from sl_bench.pty_port import PtyPort
+
+#: Places of the carriage that are remembered; in motion one every 2 ms.
+REMEMBERED = 2000
+
+
+def _between(a: Triple, b: Triple, part: float) -> Triple:
+    x, y, z = (p + min(max(part, 0.0), 1.0) * (q - p) for p, q in zip(a, b, strict=True))
+    return x, y, z
 
 
 class GrblEmulator:
@@ -57,6 +66,7 @@ class GrblEmulator:
         x, y, z = (o + s * p * 1e3 for o, s, p in zip(self._origin_mm, signs, start_m, strict=True))
         self.firmware = GrblFirmware(settings, carriage_mm=(x, y, z), homed=homed, now=clock())
         self._port = PtyPort(self._exchange, seed)
+        self._track: deque[tuple[int, Triple]] = deque(maxlen=REMEMBERED)
         self._late: list[tuple[float, bytes]] = []
         self._lose_replies = 0
         self._delay_replies = 0
@@ -102,6 +112,28 @@ class GrblEmulator:
             s * (p - o) * 1e-3 for s, p, o in zip(self._signs, place, self._origin_mm, strict=True)
         )
         return x, y, z
+
+    def position_at(self, time_ns: int) -> Triple:
+        """Where the carriage stood at a time of the host's clock, stage metres; thread-safe.
+
+        Of times that are longer past than it remembers it tells the oldest place, of times to
+        come the present one.
+        """
+        now_ns, now_m = time.time_ns(), self.position_m()
+        after_ns, after_m = now_ns, now_m
+        for before_ns, before_m in reversed(list(self._track)):
+            if before_ns <= time_ns:
+                part = (time_ns - before_ns) / max(after_ns - before_ns, 1)
+                return _between(before_m, after_m, part)
+            after_ns, after_m = before_ns, before_m
+        return now_m if time_ns >= now_ns else after_m
+
+    def _remember(self) -> None:
+        """Note where the carriage stands; where it rests, only since when and until when."""
+        place, time_ns = self.position_m(), time.time_ns()
+        if len(self._track) > 1 and self._track[-1][1] == self._track[-2][1] == place:
+            self._track.pop()
+        self._track.append((time_ns, place))
 
     # -- faults on request ------------------------------------------------------------------------
 
@@ -170,6 +202,7 @@ class GrblEmulator:
     # -- the wire -----------------------------------------------------------------------------
 
     def _exchange(self, received: bytes) -> bytes:
+        self._remember()
         with self._lock:
             now = self._clock()
             if received and not self._silent:
