@@ -221,7 +221,7 @@ def test_the_bench_s_plate_turned_over_is_named(tmp_path: Path) -> None:
     back = World(RIG, surface, Optics()).expose(
         [(np.ones(RIG.projector.image_size[::-1], np.uint8), 1 / 30)], 1 / 30, 0
     )
-    with pytest.raises(CalibrationError, match=r"turned over.* with the mark at hole \(1, 0\)"):
+    with pytest.raises(CalibrationError, match=r"turned over.* with the mark at hole \(3, 2\)"):
         find_plate(back, DEFAULT_PLATE)
     # Without a mark nobody can tell.
     assert len(find_plate(back, Plate()).ids) >= 99

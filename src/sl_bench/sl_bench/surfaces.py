@@ -276,7 +276,7 @@ def hole_plate(
     chamfer_m: float = 0.0,
     hole_albedo: float = 0.02,
     origin_diameter_m: float | None = 0.6e-3,
-    origin_id: tuple[int, int] = (1, 0),
+    origin_id: tuple[int, int] = (3, 2),
     blocked: Iterable[tuple[int, int]] = (),
     turned_over: bool = False,
 ) -> HolePlate:
@@ -295,8 +295,8 @@ def hole_plate(
     origin_diameter_m : float, optional
         Another diameter for one hole, the mark; None (or 0) for no mark.
     origin_id : (column, row)
-        The mark; (0, 0) is the hole at the smallest x and y. Next to a corner it shows which side
-        of the plate is up.
+        The mark; (0, 0) is the hole at the smallest x and y. Off diagonals and middle lines it
+        shows which side of the plate is up.
     blocked : iterable of (column, row)
         Holes that are not there.
     turned_over : bool

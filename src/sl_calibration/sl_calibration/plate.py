@@ -119,8 +119,9 @@ class Plate:
         return np.where(marked, origin, self.diameter_m) / 2
 
 
-#: The paper's plate with a mark that shows its face: what is assumed where nothing else is said.
-DEFAULT_PLATE = Plate(origin_diameter_m=0.6e-3, origin_id=(1, 0))
+#: The paper's plate with a mark that shows its face: what is assumed where nothing else is said. It
+#: lies well within the plate, so that it stays in view and in the light where the border does not.
+DEFAULT_PLATE = Plate(origin_diameter_m=0.6e-3, origin_id=(3, 2))
 
 
 @dataclass(frozen=True)
