@@ -23,7 +23,7 @@ from sl_bringup.transport import (
     SMALL_SEGMENT_BYTES,
     free_bytes,
 )
-from sl_projector.errors import SlError
+from sl_projector.errors import DeviceError, SlError
 
 PYTHON_RANGE = ((3, 11), (3, 13))
 #: Module and the name under which pip knows it.
@@ -174,6 +174,29 @@ def _calibration(file: str) -> Finding:
     except SlError as error:
         return Finding("bad", "calibration", str(error), "name another file, or calibrate anew")
     return Finding("ok", "calibration", f"{file} ({calibration.hash[:12]})")
+
+
+def find_usb(vendor: int, product: int) -> Any:
+    """Return the USB device with these ids, or None.
+
+    Raises
+    ------
+    DeviceError
+        When libusb is missing.
+    """
+    import usb.core
+
+    try:
+        return usb.core.find(idVendor=vendor, idProduct=product)
+    except usb.core.NoBackendError as error:
+        raise DeviceError("libusb is not installed") from error
+
+
+def serial_ports() -> dict[str, str]:
+    """Serial ports of this machine and what they say of themselves."""
+    from serial.tools.list_ports import comports
+
+    return {port.device: port.description for port in comports()}
 
 
 def graph(options: GraphOptions) -> list[Finding]:

@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 import sl_projector
-from sl_bringup.doctor_checks import Finding
+from sl_bringup.doctor_checks import Finding, find_usb, serial_ports
 from sl_camera.aravis_library import INSTALL as ARAVIS_INSTALL
 from sl_camera.aravis_library import find_camera, list_cameras, load_aravis
 from sl_camera.camera_drivers import make_camera
@@ -123,14 +123,11 @@ def projector(parameters: dict[str, Any], running: bool) -> list[Finding]:
 
 
 def _usb_projector(device: str, name: str, running: bool) -> list[Finding]:
-    import usb.core
-
     chip = MODELS[name].controller
     try:
-        there = {c: usb.core.find(idVendor=VENDOR, idProduct=p) for c, p in CONTROLLERS.items()}
-    except usb.core.NoBackendError:
-        remedy = "sudo apt install libusb-1.0-0"
-        return [Finding("bad", "projector", "libusb is not installed", remedy)]
+        there = {c: find_usb(VENDOR, product) for c, product in CONTROLLERS.items()}
+    except SlError as error:
+        return [Finding("bad", "projector", str(error), "sudo apt install libusb-1.0-0")]
     found = there[chip]
     if found is not None:
         node = USB_NODES / f"{found.bus:03d}" / f"{found.address:03d}"
@@ -220,12 +217,9 @@ def stage(parameters: dict[str, Any], running: bool) -> list[Finding]:
 
 def _ports() -> str:
     """Serial ports with the names that stay when they are plugged in elsewhere."""
-    from serial.tools.list_ports import comports
-
     names = {str(link.resolve()): link for link in SERIAL_NAMES.glob("*")}
-    return ", ".join(
-        f"{port.device} ({names.get(port.device, port.description)})" for port in comports()
-    )
+    ports = serial_ports().items()
+    return ", ".join(f"{port} ({names.get(port, description)})" for port, description in ports)
 
 
 def _stage_state(kind: str, node: Path, parameters: dict[str, Any], running: bool) -> Finding:

@@ -16,9 +16,9 @@ from sl_projector import dlpc350_protocol as protocol
 from sl_projector import dlpc900_protocol as common
 from sl_projector.clock import Clock
 from sl_projector.dlpc350_flash import Layout, flash_layout
-from sl_projector.dlpc900 import Dlpc900, Dlpc900Settings, Loaded
+from sl_projector.dlpc900 import Dlpc900, Dlpc900Settings
 from sl_projector.dlpc900_port import Dlpc900Port
-from sl_projector.dmd import LoadInfo, ProjectorStatus, Timing
+from sl_projector.dmd import Loaded, LoadInfo, ProjectorStatus, Timing
 from sl_projector.errors import (
     ConfigError,
     DeviceError,

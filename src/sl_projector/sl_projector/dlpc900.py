@@ -7,7 +7,6 @@ fly example: stop, mode, table entries, table configuration, images in reverse o
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import threading
 import time
 from dataclasses import dataclass, field
@@ -22,6 +21,7 @@ from sl_projector.dmd import (
     MAX_EXPOSURE_US,
     MODELS,
     DmdModel,
+    Loaded,
     LoadInfo,
     ProjectorStatus,
     RunInfo,
@@ -29,6 +29,7 @@ from sl_projector.dmd import (
     TriggerIn,
     TriggerOut,
     dmd_model,
+    sequence_digest,
 )
 from sl_projector.errors import ConfigError, DeviceError, DeviceTimeout, SequenceError
 from sl_projector.sequence import PatternSequence
@@ -71,22 +72,6 @@ class Dlpc900Settings:
     def __post_init__(self) -> None:
         if not 0 <= self.leds <= 7:
             raise ConfigError(f"leds={self.leds}; expected 0 to 7 (1 red, 2 green, 4 blue)")
-
-
-@dataclass(frozen=True)
-class Loaded:
-    """What the device holds."""
-
-    digest: str
-    places: tuple[tuple[int, int], ...]
-    timing: Timing
-    repeats: int
-
-
-def sequence_digest(sequence: PatternSequence) -> str:
-    """Return a digest of what a sequence shows, whatever its name."""
-    content = repr((sequence.dmd_size, sequence.patterns))
-    return hashlib.sha256(content.encode()).hexdigest()
 
 
 class Dlpc900:

@@ -6,6 +6,7 @@ the one for TI's DLPC900. To support another projector write such a class, nothi
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -179,6 +180,22 @@ class LoadInfo:
     image_bytes: int = 0
     messages: int = 0
     reports: int = 0
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """What a device holds: where each pattern lies, and with which timing."""
+
+    digest: str
+    places: tuple[tuple[int, int], ...]
+    timing: Timing
+    repeats: int
+
+
+def sequence_digest(sequence: PatternSequence) -> str:
+    """Return a digest of what a sequence shows, whatever its name."""
+    content = repr((sequence.dmd_size, sequence.patterns))
+    return hashlib.sha256(content.encode()).hexdigest()
 
 
 @dataclass(frozen=True)
