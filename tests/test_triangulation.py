@@ -9,7 +9,18 @@ import pytest
 
 from sl_bench.reference import reference_rig
 from sl_reconstruct.crossed import miss_m, solve_four
-from sl_reconstruct.geometry import camera_rays, geometry, ray_row, solve_points, solve_slopes
+from sl_reconstruct.geometry import (
+    DEPTH,
+    DZ,
+    PX,
+    PY,
+    PZ,
+    camera_rays,
+    geometry,
+    ray_tile,
+    solve_points,
+    solve_slopes,
+)
 from sl_reconstruct.rig import BrownConrady, Division, Rig
 
 LENSES = {
@@ -39,13 +50,13 @@ def test_three_equations_invert_the_projection(lenses: str) -> None:
     """A point projected into both devices comes back within 1e-10 m."""
     rig, points = rig_with(lenses), volume()
     q, d = rig.camera.project(points), rig.projector.project(points)
-    r = ray_row(1)
+    r = ray_tile()
     for (u, v), (column, _), p in zip(q, d, points, strict=True):
         camera_rays(geometry(rig), np.array([u]), v, r)
         solve_slopes(geometry(rig), np.array([column]), r)
-        solve_points(geometry(rig), r)
-        assert np.abs([r.px[0] - p[0], r.py[0] - p[1], r.pz[0] - p[2]]).max() < 1e-10
-        assert r.depth[0] > 0
+        solve_points(geometry(rig), 1, r)
+        assert np.abs(r[[PX, PY, PZ]] - p).max() < 1e-10
+        assert r[DEPTH] > 0
 
 
 @pytest.mark.parametrize("lenses", LENSES)
@@ -53,21 +64,21 @@ def test_dz_du_is_the_numeric_derivative(lenses: str) -> None:
     """Within 1 %: how the lens changes along the ray is left out."""
     rig, h = rig_with(lenses), 1e-3
     g, (q, d) = geometry(rig), (rig.camera.project(volume(20)), rig.projector.project(volume(20)))
-    r = ray_row(3)
+    r = ray_tile()
     for (u, v), (column, _) in zip(q, d, strict=True):
         camera_rays(g, np.array([u - h, u, u + h]), v, r)
         solve_slopes(g, np.full(3, column), r)
-        solve_points(g, r)
-        assert r.dz[1] == pytest.approx((r.pz[2] - r.pz[0]) / (2 * h), rel=1e-2)
+        solve_points(g, 3, r)
+        assert r[DZ + 1] == pytest.approx((r[PZ + 2] - r[PZ]) / (2 * h), rel=1e-2)
 
 
 def test_points_behind_a_device_have_no_depth() -> None:
     """A column far to the wrong side lets the rays diverge."""
-    g, r = geometry(reference_rig()), ray_row(1)
+    g, r = geometry(reference_rig()), ray_tile()
     camera_rays(g, np.array([800.0]), 600.0, r)
     solve_slopes(g, np.array([-9000.0]), r)
-    solve_points(g, r)
-    assert not r.depth[0] > 0
+    solve_points(g, 1, r)
+    assert not r[DEPTH] > 0
 
 
 @pytest.mark.parametrize("lenses", LENSES)

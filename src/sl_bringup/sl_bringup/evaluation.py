@@ -15,9 +15,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sl_bringup.bags import TRIGGER, Bag, open_bag, topic_names
 from sl_bringup.calibrations import Calibrations, InForce
 from sl_bringup.choices import parse_choices
@@ -30,7 +27,7 @@ from sl_bringup.stacks import decisions
 from sl_bringup.version import software_version
 from sl_camera.matching import FrameDecision, MatchedStack, StackMatcher, Status
 from sl_projector.errors import BagError, CalibrationError, SlError
-from sl_reconstruct.cloud import Cloud
+from sl_reconstruct.cloud import Cloud, median
 from sl_reconstruct.cloud_files import cloud_hash
 from sl_reconstruct.full_scale import saturation_of
 from sl_reconstruct.quality import verdict
@@ -323,7 +320,7 @@ def _result(cloud: Cloud) -> Report:
         "present_fraction": cloud.present / cloud.lit if cloud.lit else 0.0,
         "refused": dict(cloud.refused),
         "figures": _figures(cloud),
-        "median_sigma_m": _median(cloud.points["sigma"]),
+        "median_sigma_m": cloud.median_sigma_m,
     }
 
 
@@ -333,13 +330,8 @@ def _figures(cloud: Cloud) -> dict[str, float]:
     figures["bound_ratio"] = cloud.figures.bound_ratio
     for name in ("gap_m", "gap_px"):
         if (gap := getattr(cloud, name)) is not None:
-            figures[f"median_{name}"] = _median(gap)
+            figures[f"median_{name}"] = median(gap)
     return figures
-
-
-def _median(values: NDArray[Any]) -> float:
-    there = values[np.isfinite(values)]
-    return float(np.median(there)) if there.size else float("nan")
 
 
 def is_good(reports: Sequence[Mapping[str, Any]]) -> bool:

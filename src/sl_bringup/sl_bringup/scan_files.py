@@ -10,7 +10,7 @@ import numpy as np
 from sl_projector.documents import written_atomically
 from sl_projector.errors import StackError
 from sl_reconstruct.cloud import Cloud
-from sl_reconstruct.cloud_files import present, save_pcd, save_ply
+from sl_reconstruct.cloud_files import save_pcd, save_ply
 from sl_reconstruct.height_map import HeightMap, make_height_map, save_png, save_tiff
 from sl_reconstruct.plane_fit import Plane, fit_plane
 from sl_reconstruct.reasons import REFUSALS, Reason
@@ -48,8 +48,7 @@ def write_scan(
     if cloud is None:
         return {}
     notes = {key: report[key] for key in ("calibration_hash", "settings_hash", "cloud_hash")}
-    points = present(cloud.points)
-    save_ply(folder / "cloud.ply", points, notes)
+    save_ply(folder / "cloud.ply", cloud.points, notes)
     save_pcd(folder / "cloud.pcd", cloud.points, notes, organised=True)
     plane = _best_plane(cloud, report)
     height = _height_map(folder, cloud, report)

@@ -7,6 +7,7 @@ rendered on demand. Column boundary ``k`` lies between DMD columns ``k - 1`` and
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Literal
@@ -222,4 +223,10 @@ def named(name: str, dmd_size: tuple[int, int] = DEFAULT_DMD_SIZE) -> PatternSeq
     """
     if name not in NAMED:
         raise SequenceError(f"no sequence is called {name!r}; expected one of {sorted(NAMED)}")
+    return _made(name, tuple(dmd_size))
+
+
+@functools.lru_cache(maxsize=16)
+def _made(name: str, dmd_size: tuple[int, int]) -> PatternSequence:
+    """Keep what was asked for: every trigger of a built-in sequence is compared with it."""
     return NAMED[name](dmd_size)

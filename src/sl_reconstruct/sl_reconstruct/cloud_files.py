@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from sl_projector.documents import written_atomically
+from sl_reconstruct.cloud import CLOUD_DTYPE
 
-POINT_FIELDS = ("x", "y", "z", "intensity", "sigma")
+POINT_FIELDS = CLOUD_DTYPE.names or ()
 
 
 def cloud_hash(points: NDArray[Any]) -> str:
@@ -27,8 +29,24 @@ def cloud_hash(points: NDArray[Any]) -> str:
 def present(points: NDArray[Any]) -> NDArray[Any]:
     """Points that are there, (n,), in row order."""
     flat = points.reshape(-1)
+    if flat.dtype == CLOUD_DTYPE:
+        kept = np.empty(flat.shape, CLOUD_DTYPE)
+        numbers = np.ascontiguousarray(flat).view(np.float32).reshape(-1, len(POINT_FIELDS))
+        return kept[: _keep(numbers, kept.view(np.float32).reshape(numbers.shape))]
     there = np.isfinite(flat["z"])
     return flat if there.all() else np.asarray(flat[there])
+
+
+@njit(cache=True, nogil=True)
+def _keep(points: Any, kept: Any) -> int:
+    """Copy the points that have a z, and return how many."""
+    n = 0
+    for i in range(points.shape[0]):
+        if np.isfinite(points[i, 2]):
+            for j in range(5):
+                kept[n, j] = points[i, j]
+            n += 1
+    return n
 
 
 def save_ply(path: str | Path, points: NDArray[Any], notes: Mapping[str, str] | None = None) -> int:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sl_reconstruct.edges import PRESENT
 from sl_reconstruct.geometry import DIVISION, Geometry, Optics, brown_undistort
-from sl_reconstruct.points import GEOMETRY, Output, Screen, find_steps
+from sl_reconstruct.points import GEOMETRY, Around, Output, Screen, find_steps
 from sl_reconstruct.reasons import Reason
 from sl_reconstruct.rows import Lines
 
@@ -35,19 +35,21 @@ class Crossed(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def map_rows(first: int, last: int, lines: Lines, screen: Screen, v_map: Any, bad: Any) -> None:
+def map_rows(
+    first: int, last: int, lines: Lines, screen: Screen, v_map: Any, around: Around
+) -> None:
     """Fill the DMD row at the pixels of camera columns first to last; NaN where unknown.
 
     lines: row boundaries along camera columns, shape (W, DMD rows).
     """
     for x in range(first, last):
-        find_steps(lines.u_px, x, screen, bad)
+        find_steps(lines.u_px, x, screen, around)
         out, at = v_map[x], lines.u_px[x]
         out[:] = np.nan
         last_j, last_y = -1, 0.0
         for j in range(at.size):
             y = np.float64(at[j])
-            if bad[j] or np.isnan(y):
+            if around.bad[j] or np.isnan(y):
                 continue
             if last_j >= 0 and j - last_j <= MAX_GAP and y != last_y:
                 low, high = min(y, last_y), max(y, last_y)

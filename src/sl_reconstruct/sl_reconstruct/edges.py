@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from sl_reconstruct.bits import WORD, bits_from, lowest_bit, padded
 from sl_reconstruct.pixels import PixelRow, count_shift
 from sl_reconstruct.reasons import Reason
 
@@ -26,6 +27,20 @@ MISREAD_PX = 6.0
 DIP = 0.6
 SQRT_2PI = float(np.sqrt(2 * np.pi))
 
+#: Crossings that are worked on together. Their numbers lie in the lines of a tile: a constant
+#: distance apart, so that the compiler knows that they do not overlap and works on eight at once.
+TILE = 192
+#: Four filtered samples about the crossing; light a reach to the left, under it on either side,
+#: and a reach to the right; the code at those ends; whether anything there is saturated.
+A, B, C, D, LEFT, UNDER, BESIDE, RIGHT, CODE_A, CODE_B, FULL = range(0, 11 * TILE, TILE)
+#: P + N or threshold, and how many bright and dark samples the threshold has.
+LEVEL, BRIGHT, DARK = range(11 * TILE, 14 * TILE, TILE)
+#: What is found: the zero and its slope there, noise gain, sigma and width, k, and whether the
+#: evidence agrees with it, why it is refused or 0.
+FRACTION, SLOPE, PHASE, GAIN, PROFILE, SIGMA, WIDTH, K, AGREED, WHY = range(
+    14 * TILE, 24 * TILE, TILE
+)
+LINES = 24
 CONTRAST = int(Reason.CONTRAST)
 SATURATION = int(Reason.SATURATION)
 IDENTITY = int(Reason.IDENTITY)
@@ -80,23 +95,13 @@ class Tuning(NamedTuple):
 class SourceRow(NamedTuple):
     """Scratch for one source in one row: signal, filtered signal, crossings.
 
-    ``marks`` has a byte for each pixel, and is seen as ``words``; ``at`` lists the crossings.
-    For each of them: ``fraction`` and ``slope`` of the zero, ``sigma`` and ``width``, ``k`` with
-    ``agreed``, and ``why`` it is refused or 0.
+    ``at`` lists the crossings; ``tile`` holds the numbers of up to TILE of them, line by line.
     """
 
     signal: NDArray[np.float32]
     filtered: NDArray[np.float32]
-    words: NDArray[np.uint64]
-    marks: NDArray[np.uint8]
-    at: NDArray[np.int32]
-    fraction: NDArray[np.float32]
-    slope: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    width: NDArray[np.float32]
-    k: NDArray[np.int32]
-    agreed: NDArray[np.uint8]
-    why: NDArray[np.uint8]
+    at: NDArray[np.uint32]
+    tile: NDArray[np.float32]
 
 
 class Found(NamedTuple):
@@ -111,11 +116,9 @@ class Found(NamedTuple):
 
 def source_row(width: int) -> SourceRow:
     """Return scratch for rows of ``width`` pixels."""
-    words = np.zeros((width + 7) // 8, np.uint64)
-    types = [np.int32, *[np.float32] * 4, np.int32, np.uint8, np.uint8]
     return SourceRow(
-        np.zeros(width, np.float32), np.zeros(width, np.float32), words, words.view(np.uint8),
-        *(np.zeros(width + 8, t) for t in types),
+        np.zeros(width, np.float32), padded(width, np.float32),
+        np.zeros(width, np.uint32), np.zeros(LINES * TILE, np.float32),
     )  # fmt: skip
 
 
@@ -186,32 +189,73 @@ def bar_centres(signal: Any, out: Any) -> None:
             inner[x] += left[x] - right[x]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def find_crossings(lit: Any, r: SourceRow, first: int, last: int) -> int:
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def find_crossings(lit: Any, filtered: Any, at: Any, first: int, last: int) -> int:
     """List where the signal changes sign between a pixel and the next, and either is lit.
 
     Returns their number; only pixels ``first <= x < last`` are listed.
     """
-    filtered, marks, words, at = r.filtered, r.marks, r.words, r.at
-    n = filtered.size
-    for x in range(n - 1):
-        turn = (filtered[x] >= 0) != (filtered[x + 1] >= 0)
-        marks[x] = np.uint8(turn) & (lit[x] | lit[x + 1])
-    for x in range(first):
-        marks[x] = 0
-    for x in range(last, n):
-        marks[x] = 0
-    found = 0
-    for word in range(words.size):
-        if words[word]:
-            for x in range(8 * word, 8 * word + 8):
-                at[found] = x
-                found += marks[x]
+    found, one, every = 0, np.uint64(1), ~np.uint64(0)
+    for x in range(first - first % WORD, last, WORD):
+        turn = bits_from(filtered, x) ^ bits_from(filtered, x + 1)
+        turn &= bits_from(lit, x) | bits_from(lit, x + 1)
+        if x < first:
+            turn &= every << np.uint64(first - x)
+        if last - x < WORD:
+            turn &= ~(every << np.uint64(last - x))
+        while turn:
+            at[found] = np.uint64(x) + lowest_bit(turn)
+            found += 1
+            turn &= turn - one
     return found
 
 
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def gather(p: PixelRow, r: SourceRow, first: int, n: int, t: Tuning) -> None:
+    """Put what lies about n crossings from ``first`` on into the tile."""
+    at, tile, filtered = r.at[first : first + n], r.tile, r.filtered
+    light, code, clipped = p.light, p.code, p.clipped
+    one, two, reach = np.uint64(1), np.uint64(2), np.uint64(t.reach_px)
+    for i in range(n):
+        x = np.uint64(at[i])
+        a, b = x - reach, x + one + reach
+        tile[A + i], tile[B + i] = filtered[x - one], filtered[x]
+        tile[C + i], tile[D + i] = filtered[x + one], filtered[x + two]
+        tile[LEFT + i], tile[UNDER + i] = light[a], light[x]
+        tile[BESIDE + i], tile[RIGHT + i] = light[x + one], light[b]
+        tile[CODE_A + i], tile[CODE_B + i] = code[a], code[b]
+    if not p.any_clipped[0]:
+        tile[FULL : FULL + n] = np.float32(0)
+        return
+    for i in range(n):
+        x = np.uint64(at[i])
+        here = clipped[x] | clipped[x + one]
+        tile[FULL + i] = clipped[x - reach] | here | clipped[x + one + reach]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def gather_pair(pattern: Any, inverse: Any, r: SourceRow, first: int, n: int) -> None:
+    """Put the light of a pair at its crossings into the tile."""
+    at, tile = r.at[first : first + n], r.tile
+    for i in range(n):
+        x = np.uint64(at[i])
+        tile[LEVEL + i] = np.float32(pattern[x]) + np.float32(inverse[x])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def gather_single(p: PixelRow, r: SourceRow, first: int, n: int) -> None:
+    """Put the threshold at a single image's crossings, and what it rests on, into the tile."""
+    at, tile = r.at[first : first + n], r.tile
+    threshold, bright, dark = p.threshold, p.bright, p.dark
+    shift = count_shift(bright.itemsize)
+    for i in range(n):
+        x = np.uint64(at[i])
+        tile[LEVEL + i] = threshold[x]
+        tile[BRIGHT + i], tile[DARK + i] = bright[x] >> shift, dark[x] >> shift
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def find_zeros(filtered: Any, at: Any, count: int, fraction: Any, slope: Any) -> None:
+def find_zeros(tile: Any, n: int) -> None:
     """Zero of the cubic through four samples about each crossing, and the slope there.
 
     A secant between the two middle samples, and one Newton step: the filtered signal is nearly
@@ -219,142 +263,158 @@ def find_zeros(filtered: Any, at: Any, count: int, fraction: Any, slope: Any) ->
     """
     half, third, sixth = np.float32(1 / 2), np.float32(1 / 3), np.float32(1 / 6)
     two, three = np.float32(2), np.float32(3)
-    for i in range(count):
-        x = at[i]
-        a, b, c, d = filtered[x - 1], filtered[x], filtered[x + 1], filtered[x + 2]
+    for i in range(n):
+        a, b, c, d = tile[A + i], tile[B + i], tile[C + i], tile[D + i]
         c1 = c - third * a - half * b - sixth * d
         c2 = half * (a + c) - b
         c3 = sixth * (d - a) + half * (b - c)
         t = b / (b - c)
         value = b + t * (c1 + t * (c2 + t * c3))
         t -= value / (c1 + t * (two * c2 + t * three * c3))
-        fraction[i] = t
-        slope[i] = abs(c1 + t * (two * c2 + t * three * c3))
-
-
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def light_fails(left: float, under: float, right: float, t: Tuning) -> int:
-    """Reason why the light left of, under and right of an edge does not do, or 0."""
-    sides, most = min(left, right), max(left, right)
-    least = min(under, sides)
-    if max(most, under) < t.contrast_dn:
-        return CONTRAST
-    if least < t.min_light * most or under < DIP * sides:
-        return SHADOW
-    return CONTRAST if least < t.contrast_dn else 0
+        tile[FRACTION + i] = t
+        tile[SLOPE + i] = abs(c1 + t * (two * c2 + t * three * c3))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def check_light(light: Any, clipped: Any, at: Any, count: int, t: Tuning, why: Any) -> None:
+def check_light(tile: Any, n: int, t: Tuning) -> None:
     """Write for each crossing why the light under it does not do, or 0."""
-    last = light.size - 1
-    for i in range(count):
-        x = np.int64(at[i])
-        a, b = max(0, x - t.reach_px), min(last, x + 1 + t.reach_px)
-        reason = light_fails(light[a], min(light[x], light[x + 1]), light[b], t)
-        full = clipped[a] | clipped[x] | clipped[x + 1] | clipped[b]
-        why[i] = SATURATION if full and reason != CONTRAST else reason
+    contrast, saturation, shadow = np.float32(CONTRAST), np.float32(SATURATION), np.float32(SHADOW)
+    none = np.float32(0)
+    for i in range(n):
+        left, right = tile[LEFT + i], tile[RIGHT + i]
+        under, beside = tile[UNDER + i], tile[BESIDE + i]
+        under = beside if beside < under else under
+        sides, most = (left, right) if left < right else (right, left)
+        least = under if under < sides else sides
+        faint = (most < t.contrast_dn) & (under < t.contrast_dn)
+        dark = (least < t.min_light * most) | (under < DIP * sides)
+        why = shadow if dark else (contrast if least < t.contrast_dn else none)
+        why = contrast if faint else why
+        full = (tile[FULL + i] != none) & (why != contrast)
+        tile[WHY + i] = saturation if full else why
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def identify(
-    code: Any, r: SourceRow, count: int, rising_px: int, half: int, flip: bool, t: Tuning
-) -> None:
+def identify(tile: Any, n: int, rising_px: int, half: int, flip: bool, t: Tuning) -> None:
     """Name the boundary k of each crossing, and whether the evidence agrees.
 
     The edge's pattern and polarity say k modulo 4 D; the Gray code on either side says where.
     Where they disagree, the pattern's edge next to the code's place is named. k is 0 where there
     is none on the DMD. ``flip`` exchanges the polarities.
     """
-    at, ks, agreed, filtered = r.at, r.k, r.agreed, r.filtered
-    period, tolerance = 4.0 * half, max(0.5 * t.division_px + 1.5, min(0.9 * half, MISREAD_PX))
-    most = 2.5 * (2 * t.reach_px + 1) / t.scale + t.division_px
-    last, turn = code.size - 1, flip != (t.direction < 0)
-    for i in range(count):
-        x = np.int64(at[i])
-        a = np.int64(code[max(0, x - t.reach_px)])
-        b = np.int64(code[min(last, x + 1 + t.reach_px)])
-        ahead = (b - a) * t.direction * t.division_px
-        middle = 0.5 * (a + b + 1) * t.division_px
-        falling = (filtered[x] < 0) == turn
-        first = rising_px + 2.0 * half * falling
-        k = first + period * np.floor((middle - first) * (1.0 / period) + 0.5)
-        near = abs(k - middle) <= tolerance
-        if not near:
-            k = rising_px + 0.5 * period * np.floor((middle - rising_px) * (2.0 / period) + 0.5)
-        inside = (k > 0) & (k < t.size_px)
-        ks[i] = np.int32(k) if inside else np.int32(0)
-        agreed[i] = np.uint8(near & inside & (ahead >= -t.division_px) & (ahead <= most))
+    f, stripe = np.float32, np.float32(2 * half)
+    near_px = f(max(0.5 * t.division_px + 1.5, min(0.9 * half, MISREAD_PX)))
+    most = f(2.5 * (2 * t.reach_px + 1) / t.scale + t.division_px)
+    rising = f(rising_px)
+    turn = flip != (t.direction < 0)
+    after_dark, after_bright = rising + stripe * f(turn), rising + stripe * f(not turn)
+    division, forward = f(t.division_px), f(t.direction * t.division_px)
+    period, per_period, per_stripe = f(4 * half), f(0.25 / half), f(0.5 / half)
+    size, half_px, one, none = f(t.size_px), f(0.5), f(1), f(0)
+    for i in range(n):
+        a, b = tile[CODE_A + i], tile[CODE_B + i]
+        ahead = (b - a) * forward
+        middle = half_px * (a + b + one) * division
+        first = after_dark if tile[B + i] < none else after_bright
+        k = first + period * np.floor((middle - first) * per_period + half_px)
+        near = abs(k - middle) <= near_px
+        k = k if near else rising + stripe * np.floor((middle - rising) * per_stripe + half_px)
+        inside = (k > none) & (k < size)
+        tile[K + i] = k if inside else none
+        tile[AGREED + i] = near & inside & (ahead >= -division) & (ahead <= most)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def pair_variance(
-    total: float, gain: float, profile_gain: float, plateau: float, t: Tuning
-) -> float:
+    total: float, gain: float, profile_gain: float, plateau: float, read: float, shot: float
+) -> Any:
     """Variance of a pair's filtered signal times total^2, DN^2; total = P + N at the edge.
 
     var((P - N)/(P + N)) = [2 a (1 + q^2) + b S (1 - q^2)] / S^2 for pixel noise a + b * level.
     """
     q2 = profile_gain * plateau * plateau
-    return 2 * t.noise_dn2 * (gain + q2) + t.noise_dn * total * (gain - q2)
+    return (read + read) * (gain + q2) + shot * total * (gain - q2)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def single_variance(
-    threshold_dn: float, light_dn: float, bright: int, dark: int, level_dn: float, t: Tuning
-) -> Any:
-    """Variance of a single image's samples about ``level_dn``, and of their threshold, DN^2.
+    threshold: float, swing: float, bright: float, dark: float, level: float,
+    read: float, shot: float,
+) -> Any:  # fmt: skip
+    """Variance of a single image's samples about ``level``, and of their threshold, DN^2.
 
-    The threshold is the middle between the means of so many bright and dark samples.
+    The threshold is the middle between the means, ``swing`` off it, of so many bright and dark
+    samples.
     """
-    high = t.noise_dn2 + t.noise_dn * (threshold_dn + 0.5 * light_dn)
-    low = t.noise_dn2 + t.noise_dn * (threshold_dn - 0.5 * light_dn)
-    own = t.noise_dn2 + t.noise_dn * level_dn
-    return own + 0.25 * (high * dark + low * bright) / (bright * dark)
+    high = read + shot * (threshold + swing)
+    low = read + shot * (threshold - swing)
+    quarter = np.float32(0.25)
+    return read + shot * level + quarter * (high * dark + low * bright) / (bright * dark)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def phase_of(fraction: float) -> int:
-    """Row of the gain table for a sub-pixel phase."""
-    return min(PHASES, max(0, int(fraction * PHASES + 0.5)))
+def look_up_gain(tile: Any, n: int, gain: Any) -> None:
+    """Noise gain of the estimator at the sub-pixel phase of each crossing."""
+    phases, half, none = np.float32(PHASES), np.float32(0.5), np.float32(0)
+    for i in range(n):
+        phase = np.floor(tile[FRACTION + i] * phases + half)
+        phase = phase if phase > none else none
+        tile[PHASE + i] = phase if phase < phases else phases
+    for i in range(n):
+        row = np.uint64(tile[PHASE + i])
+        tile[GAIN + i], tile[PROFILE + i] = gain[row, 0], gain[row, 1]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def weigh_pairs(
-    pattern: Any, inverse: Any, light: Any, gain: Any, full_slope: float, t: Tuning,
-    r: SourceRow, count: int,
-) -> None:  # fmt: skip
+def weigh_pairs(tile: Any, n: int, full_slope: float, t: Tuning) -> None:
     """Write sigma of each crossing of a pair, and how wide it is against what is expected."""
-    at, fraction, slope, sigma, width = r.at, r.fraction, r.slope, r.sigma, r.width
-    for i in range(count):
-        x = at[i]
-        whole = np.float64(pattern[x]) + np.float64(inverse[x]) + t.floor_dn
-        row = phase_of(fraction[i])
-        variance = pair_variance(whole, gain[row, 0], gain[row, 1], light[x] / whole, t)
-        steep = slope[i] * whole
-        inverse_steep = np.float32(1) / np.float32(steep)
-        sigma[i] = np.sqrt(np.float32(variance)) * inverse_steep
-        width[i] = np.float32(2) * light[x] * np.float32(full_slope) * inverse_steep
+    one, twice = np.float32(1), np.float32(2 * full_slope)
+    read, shot, floor = np.float32(t.noise_dn2), np.float32(t.noise_dn), np.float32(t.floor_dn)
+    for i in range(n):
+        light = tile[UNDER + i]
+        whole = tile[LEVEL + i] + floor
+        plateau = light / whole
+        variance = pair_variance(whole, tile[GAIN + i], tile[PROFILE + i], plateau, read, shot)
+        per_steep = one / (tile[SLOPE + i] * whole)
+        tile[SIGMA + i] = np.sqrt(variance) * per_steep
+        tile[WIDTH + i] = twice * light * per_steep
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def weigh_singles(
-    p: PixelRow, gain: Any, full_slope: float, centre: bool, t: Tuning, r: SourceRow, count: int
-) -> None:
+def weigh_singles(tile: Any, n: int, full_slope: float, centre: bool, t: Tuning) -> None:
     """Write sigma and width of each crossing of a single image, or of BR8 on it.
 
     An edge's samples lie about the threshold, those of a centre are all bright or all dark.
     """
-    at, fraction, slope, sigma, width = r.at, r.fraction, r.slope, r.sigma, r.width
-    threshold, light, bright, dark, filtered = p.threshold, p.light, p.bright, p.dark, r.filtered
-    shift = count_shift(bright.itemsize)
-    for i in range(count):
-        x = at[i]
-        level = np.float64(threshold[x])
-        if centre:
-            level += 0.5 * light[x] if filtered[x] < 0 else -0.5 * light[x]
-        b, d = max(1, bright[x] >> shift), max(1, dark[x] >> shift)
-        variance = single_variance(threshold[x], light[x], b, d, level, t)
-        variance *= gain[phase_of(fraction[i]), 0]
-        sigma[i] = np.sqrt(np.float32(variance)) / (light[x] * slope[i])
-        width[i] = np.float32(full_slope) / slope[i]
+    off, half = np.float32(0.5 if centre else 0.0), np.float32(0.5)
+    read, shot = np.float32(t.noise_dn2), np.float32(t.noise_dn)
+    expected, one, none = np.float32(full_slope), np.float32(1), np.float32(0)
+    for i in range(n):
+        light, threshold = tile[UNDER + i], tile[LEVEL + i]
+        level = threshold + light * (off if tile[B + i] < none else -off)
+        bright, dark = tile[BRIGHT + i], tile[DARK + i]
+        bright, dark = bright if bright > one else one, dark if dark > one else one
+        variance = single_variance(threshold, half * light, bright, dark, level, read, shot)
+        per_slope = one / tile[SLOPE + i]
+        tile[SIGMA + i] = np.sqrt(variance * tile[GAIN + i]) * per_slope / light
+        tile[WIDTH + i] = expected * per_slope
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def judge(tile: Any, n: int, least: float, most: float, tally: Any) -> None:
+    """Refuse crossings of another shape than the blur makes, or whose identity disagrees."""
+    low, high = np.float32(least), np.float32(most)
+    first, last = np.float32(-0.5), np.float32(1.5)
+    none, shape, identity = np.float32(0), np.float32(SHAPE), np.float32(IDENTITY)
+    accepted = confused = 0
+    for i in range(n):
+        width, fraction, why = tile[WIDTH + i], tile[FRACTION + i], tile[WHY + i]
+        shaped = (width >= low) & (width <= high) & (fraction >= first) & (fraction <= last)
+        why = why if (why != none) | shaped else shape
+        doubt = (why == none) & (tile[AGREED + i] == none)
+        why = identity if doubt else why
+        tile[WHY + i] = why
+        confused += doubt
+        accepted += why == none
+    tally[0] += accepted
+    tally[1] += confused

@@ -56,15 +56,15 @@ def noise_gain(taps: Array, blur_px: float) -> Array:
 
     The second column weights with the squared profile of a unit blurred step.
     """
-    full = np.concatenate([taps[:0:-1], taps])
     radius = taps.size - 1
-    out = np.zeros((PHASES + 1, 2))
-    for i, phase in enumerate(np.linspace(0, 1, PHASES + 1).tolist()):
-        weights = np.convolve(cubic_weights(phase), full)
-        x = np.arange(weights.size) - 1 - radius - phase
-        profile = erf(x / (np.sqrt(2) * max(blur_px, 1e-3)))
-        out[i] = np.sum(weights**2), np.sum(weights**2 * profile**2)
-    return out
+    phases = np.linspace(0, 1, PHASES + 1)
+    shifted = np.zeros((4, taps.size * 2 + 2))
+    for i, row in enumerate(shifted):
+        row[i : i + 2 * radius + 1] = np.concatenate([taps[:0:-1], taps])
+    weights = np.array([cubic_weights(phase) for phase in phases.tolist()]) @ shifted
+    x = np.arange(shifted.shape[1]) - 1 - radius - phases[:, None]
+    profile = erf(x / (np.sqrt(2) * max(blur_px, 1e-3)))
+    return np.stack([np.sum(weights**2, 1), np.sum((weights * profile) ** 2, 1)], axis=1)
 
 
 @cache

@@ -2,8 +2,8 @@
 
 The camera ray ``O + t d`` in projector coordinates is ``a + t b``. A boundary fixes the
 projector's observed u, so ``t = (X a_z - a_x) / (b_x - X b_z)`` with X the ideal slope u: three
-equations, one solution. X depends weakly on the row through the lens, hence a short fixed-point
-iteration. Lengths are metres, arithmetic is double.
+equations, one solution. X depends weakly on the row through the lens, hence a short iteration.
+Lengths are metres, arithmetic is double.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from sl_reconstruct.rig import Device, Division, Rig
 
 DIVISION, BROWN_CONRADY = 0, 1
-#: Iterations allowed to a lens model. They contract by the distortion (0.1 at most), so that the
-#: last step, of SOLVED in slope, leaves less than 1e-10 m at 1 m.
+#: Iterations allowed to a lens model. They contract at least by the distortion (0.1 at most), so
+#: that the last step, of SOLVED in slope, leaves less than 1e-10 m at 1 m.
 MAX_ITERATIONS = 60
 SOLVED = 1e-9
 #: An undistortion without such a margin goes on to this step.
@@ -53,29 +53,14 @@ class Geometry(NamedTuple):
     b: Array
 
 
-class Rays(NamedTuple):
-    """Scratch for one row, one entry per boundary.
-
-    ``x``, ``y``: ideal camera slopes; ``dx``, ``dy``: their change per pixel of u; ``bx``,
-    ``by``, ``bz``: the camera ray in the projector; ``state``: what the lens iteration keeps (h
-    of the paper's lens, slope x of OpenCV's); ``slope``: ideal slope X of the boundary. Results:
-    ``px``, ``py``, ``pz`` in the world, ``dz``: dz/du, ``depth``: the smaller of both depths.
-    """
-
-    x: Array
-    y: Array
-    dx: Array
-    dy: Array
-    bx: Array
-    by: Array
-    bz: Array
-    state: Array
-    slope: Array
-    px: Array
-    py: Array
-    pz: Array
-    dz: Array
-    depth: Array
+#: Boundaries that are solved together; their numbers lie in the lines of a tile, a constant
+#: distance apart, so that the compiler knows that they do not overlap.
+RAYS = 128
+#: Ideal camera slopes, and their change per pixel of u; the camera ray in the projector; what the
+#: lens iteration keeps (observed row); ideal slope X of the boundary; the lens equation's numbers.
+X, Y, DX, DY, BX, BY, BZ, STATE, SLOPE, P, Q = range(0, 11 * RAYS, RAYS)
+#: Results: point in the world, dz/du, the smaller of both depths.
+PX, PY, PZ, DZ, DEPTH = range(11 * RAYS, 16 * RAYS, RAYS)
 
 
 def optics(device: Device) -> Optics:
@@ -99,9 +84,9 @@ def geometry(rig: Rig) -> Geometry:
     )  # fmt: skip
 
 
-def ray_row(n: int) -> Rays:
-    """Return scratch for n boundaries."""
-    return Rays(*(np.zeros(n) for _ in Rays._fields))
+def ray_tile() -> Array:
+    """Return scratch for up to RAYS boundaries, a line for each of X to DEPTH."""
+    return np.zeros(16 * RAYS)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -116,15 +101,16 @@ def brown_forward(lens: Any, x: float, y: float) -> tuple[float, float, float, f
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _division_rays(o: Optics, u: Any, v: float, r: Rays) -> None:
+def _division_rays(o: Optics, u: Any, v: float, r: Array) -> None:
     kappa, dv = o.lens[0], v - o.cv
-    for k in range(r.x.size):
-        du = u[k] - o.cu
+    cu, per_fx, y = o.cu, 1 / o.fx, dv / o.fy
+    for k in range(u.size):
+        du = u[k] - cu
         h = 1 + kappa * (du * du + dv * dv)
-        r.x[k] = du * h / o.fx
-        r.y[k] = dv * h / o.fy
-        r.dx[k] = (h + 2 * kappa * du * du) / o.fx
-        r.dy[k] = 2 * kappa * du * dv / o.fy
+        r[X + k] = du * h * per_fx
+        r[Y + k] = y * h
+        r[DX + k] = (h + 2 * kappa * du * du) * per_fx
+        r[DY + k] = 2 * kappa * du * y
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -141,104 +127,111 @@ def brown_undistort(lens: Any, xd: float, yd: float) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _brown_rays(o: Optics, u: Any, v: float, r: Rays) -> None:
-    for k in range(r.x.size):
+def _brown_rays(o: Optics, u: Any, v: float, r: Array) -> None:
+    for k in range(u.size):
         x, y = brown_undistort(o.lens, (u[k] - o.cu) / o.fx, (v - o.cv) / o.fy)
         radial, _, _, dxx, dyx = brown_forward(o.lens, x, y)
-        r.x[k], r.y[k] = x, y
-        r.dx[k] = 1 / (dxx * o.fx)
-        r.dy[k] = -dyx / (dxx * radial * o.fx)
+        r[X + k], r[Y + k] = x, y
+        r[DX + k] = 1 / (dxx * o.fx)
+        r[DY + k] = -dyx / (dxx * radial * o.fx)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def camera_rays(g: Geometry, u: Any, v: float, r: Rays) -> None:
+def camera_rays(g: Geometry, u: Any, v: float, r: Array) -> None:
     """Fill the rays of observed camera pixels (u, v): ideal slopes, derivatives along u."""
     if g.camera.model == DIVISION:
         _division_rays(g.camera, u, v, r)
     else:
         _brown_rays(g.camera, u, v, r)
     b = g.b
-    for k in range(r.x.size):
-        x, y = r.x[k], r.y[k]
-        r.bx[k] = b[0, 0] * x + b[0, 1] * y + b[0, 2]
-        r.by[k] = b[1, 0] * x + b[1, 1] * y + b[1, 2]
-        r.bz[k] = b[2, 0] * x + b[2, 1] * y + b[2, 2]
+    b00, b01, b02, b10, b11, b12 = b[0, 0], b[0, 1], b[0, 2], b[1, 0], b[1, 1], b[1, 2]
+    b20, b21, b22 = b[2, 0], b[2, 1], b[2, 2]
+    for k in range(u.size):
+        x, y = r[X + k], r[Y + k]
+        r[BX + k] = b00 * x + b01 * y + b02
+        r[BY + k] = b10 * x + b11 * y + b12
+        r[BZ + k] = b20 * x + b21 * y + b22
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _start(g: Geometry, u_d: Any, r: Rays) -> None:
-    o = g.projector
-    for k in range(r.x.size):
-        du = u_d[k] - o.cu
-        h = 1 + o.lens[0] * du * du
-        r.state[k] = h if o.model == DIVISION else du / o.fx
-        r.slope[k] = du * h / o.fx if o.model == DIVISION else du / o.fx
+def _division_slopes(g: Geometry, u_d: Any, r: Array) -> None:
+    """Slopes through the paper's lens, by Newton's method.
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _division_step(g: Geometry, u_d: Any, r: Rays) -> int:
+    The ideal row is linear in the slope, and the slope in h: ``dv h = p + q h`` with the observed
+    ``dv`` and ``h = 1 + kappa (du^2 + dv^2)``, a cubic in dv whose root lies near ``p + q``.
+    """
     a0, a1, a2 = g.a[0], g.a[1], g.a[2]
     o = g.projector
-    kappa = o.lens[0]
-    moving = 0
-    for k in range(r.x.size):
-        over = r.slope[k] * a2 - a0
-        under = r.bx[k] - r.slope[k] * r.bz[k]
-        dv = o.fy * (a1 * under + over * r.by[k]) / ((a2 * under + over * r.bz[k]) * r.state[k])
-        du = u_d[k] - o.cu
-        h = 1 + kappa * (du * du + dv * dv)
-        moving += abs(h - r.state[k]) > SOLVED
-        r.state[k] = h
-        r.slope[k] = du * h / o.fx
-    return moving
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _brown_step(g: Geometry, u_d: Any, r: Rays) -> int:
-    a, o = g.a, g.projector
-    moving = 0
-    for k in range(r.x.size):
-        over = r.slope[k] * a[2] - a[0]
-        under = r.bx[k] - r.slope[k] * r.bz[k]
-        y = (a[1] * under + over * r.by[k]) / (a[2] * under + over * r.bz[k])
-        radial, tx, _, _, _ = brown_forward(o.lens, r.slope[k], y)
-        last = r.slope[k]
-        r.slope[k] = ((u_d[k] - o.cu) / o.fx - tx) / radial
-        moving += abs(r.slope[k] - last) > SOLVED
-    return moving
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def solve_slopes(g: Geometry, u_d: Any, r: Rays) -> None:
-    """Fill ``slope``: the ideal slope X of each observed column, where the camera ray meets it."""
-    _start(g, u_d, r)
+    kappa, cu, per_fx, fy, three = o.lens[0], o.cu, 1 / o.fx, o.fy, 3 * o.lens[0]
+    for k in range(u_d.size):
+        bx, by, bz, du = r[BX + k], r[BY + k], r[BZ + k], u_d[k] - cu
+        scale = fy / (a2 * bx - a0 * bz)
+        p, q = scale * (a1 * bx - a0 * by), scale * (a2 * by - a1 * bz) * du * per_fx
+        c = 1 + kappa * du * du
+        r[P + k], r[Q + k], r[STATE + k] = p, q, q + p / (c + kappa * (p + q) * (p + q))
     for _ in range(MAX_ITERATIONS):
-        if g.projector.model == DIVISION:
-            moving = _division_step(g, u_d, r)
-        else:
-            moving = _brown_step(g, u_d, r)
+        moving = 0
+        for k in range(u_d.size):
+            p, q, dv, du = r[P + k], r[Q + k], r[STATE + k], u_d[k] - cu
+            c = 1 + kappa * du * du
+            slope = c + three * dv * dv - 2 * kappa * dv * q
+            dv -= ((dv - q) * (c + kappa * dv * dv) - p) / slope
+            h = c + kappa * dv * dv
+            # what Newton's next step would change h by
+            moving += abs(((dv - q) * h - p) * 2 * kappa * dv) > SOLVED * abs(slope)
+            r[STATE + k] = dv
+            r[SLOPE + k] = du * h * per_fx
         if moving == 0:
             break
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def solve_points(g: Geometry, r: Rays) -> None:
+def _brown_slopes(g: Geometry, u_d: Any, r: Array) -> None:
+    """Slopes through OpenCV's lens, by a fixed-point iteration."""
+    a, o = g.a, g.projector
+    for k in range(u_d.size):
+        r[SLOPE + k] = (u_d[k] - o.cu) / o.fx
+    for _ in range(MAX_ITERATIONS):
+        moving = 0
+        for k in range(u_d.size):
+            last = r[SLOPE + k]
+            over = last * a[2] - a[0]
+            under = r[BX + k] - last * r[BZ + k]
+            y = (a[1] * under + over * r[BY + k]) / (a[2] * under + over * r[BZ + k])
+            radial, tx, _, _, _ = brown_forward(o.lens, last, y)
+            slope = ((u_d[k] - o.cu) / o.fx - tx) / radial
+            moving += abs(slope - last) > SOLVED
+            r[SLOPE + k] = slope
+        if moving == 0:
+            break
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def solve_slopes(g: Geometry, u_d: Any, r: Array) -> None:
+    """Fill SLOPE: the ideal slope X of each observed column, where the camera ray meets it."""
+    if g.projector.model == DIVISION:
+        _division_slopes(g, u_d, r)
+    else:
+        _brown_slopes(g, u_d, r)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def solve_points(g: Geometry, n: int, r: Array) -> None:
     """Fill the world points and dz/du; depth is not positive where no rays meet in front."""
-    a0, a2, b, w, o = g.a[0], g.a[2], g.b, g.world, g.origin
+    a0, a2, b, w = g.a[0], g.a[2], g.b, g.world
+    o0, o1, o2 = g.origin[0], g.origin[1], g.origin[2]
     b00, b01, b20, b21 = b[0, 0], b[0, 1], b[2, 0], b[2, 1]
-    for k in range(r.x.size):
-        t = (r.slope[k] * a2 - a0) / (r.bx[k] - r.slope[k] * r.bz[k])
-        depth = a2 + t * r.bz[k]
-        r.depth[k] = t if t < depth else depth
-        r.state[k] = t
-    for k in range(r.x.size):
-        t, x, y = r.state[k], r.x[k], r.y[k]
-        r.px[k] = o[0] + t * (w[0, 0] * x + w[0, 1] * y + w[0, 2])
-        r.py[k] = o[1] + t * (w[1, 0] * x + w[1, 1] * y + w[1, 2])
-        r.pz[k] = o[2] + t * (w[2, 0] * x + w[2, 1] * y + w[2, 2])
-    for k in range(r.x.size):
-        t, dx, dy = r.state[k], r.dx[k], r.dy[k]
-        turn = b00 * dx + b01 * dy - r.slope[k] * (b20 * dx + b21 * dy)
-        dt = -t * turn / (r.bx[k] - r.slope[k] * r.bz[k])
-        ray_z = w[2, 0] * r.x[k] + w[2, 1] * r.y[k] + w[2, 2]
-        r.dz[k] = dt * ray_z + t * (w[2, 0] * dx + w[2, 1] * dy)
+    w00, w01, w02, w10, w11, w12 = w[0, 0], w[0, 1], w[0, 2], w[1, 0], w[1, 1], w[1, 2]
+    w20, w21, w22 = w[2, 0], w[2, 1], w[2, 2]
+    for k in range(n):
+        x, y, dx, dy, slope, bz = r[X + k], r[Y + k], r[DX + k], r[DY + k], r[SLOPE + k], r[BZ + k]
+        per_under = 1 / (r[BX + k] - slope * bz)
+        t = (slope * a2 - a0) * per_under
+        depth = a2 + t * bz
+        r[DEPTH + k] = t if t < depth else depth
+        ray_z = w20 * x + w21 * y + w22
+        r[PX + k] = o0 + t * (w00 * x + w01 * y + w02)
+        r[PY + k] = o1 + t * (w10 * x + w11 * y + w12)
+        r[PZ + k] = o2 + t * ray_z
+        dt = -t * (b00 * dx + b01 * dy - slope * (b20 * dx + b21 * dy)) * per_under
+        r[DZ + k] = dt * ray_z + t * (w20 * dx + w21 * dy)

@@ -17,6 +17,8 @@ from sl_projector.errors import SlError, StackError
 #: Neighbours further apart than so many typical spacings lie on different sides of a step or gap.
 MAX_STRETCH = 4.0
 MAX_NODES = 16_000_000
+#: A node counts as under a triangle so far beyond its edge, in parts of the triangle.
+EDGE = 1e-9
 #: Spacings are measured on about so many neighbours.
 SAMPLES = 200_000
 
@@ -139,8 +141,56 @@ def _rasterise(
         if r == 0:
             continue
         for c in range(columns - 1):
-            _triangle(u, v, w, out, limit_m, step_m, (0, c), (0, c + 1), (1, c))
-            _triangle(u, v, w, out, limit_m, step_m, (1, c + 1), (1, c), (0, c + 1))
+            if not _quad(u, v, w, out, limit_m / step_m, c):
+                _triangle(u, v, w, out, limit_m, step_m, (0, c), (0, c + 1), (1, c))
+                _triangle(u, v, w, out, limit_m, step_m, (1, c + 1), (1, c), (0, c + 1))
+
+
+@numba.njit(cache=True, nogil=True)
+def _quad(
+    u: NDArray[np.float64],
+    v: NDArray[np.float64],
+    z: NDArray[np.float64],
+    out: NDArray[np.float32],
+    limit: float,
+    c: int,
+) -> bool:
+    """Fill the nodes under the two triangles of a cell at once; false where that cannot be done.
+
+    That is where a corner is missing, or the cell is large or flat.
+    """
+    ua, ub, uc, ud = u[0, c], u[0, c + 1], u[1, c], u[1, c + 1]
+    va, vb, vc, vd = v[0, c], v[0, c + 1], v[1, c], v[1, c + 1]
+    za, zb, zc, zd = z[0, c], z[0, c + 1], z[1, c], z[1, c + 1]
+    least_u, most_u = min(min(ua, ub), min(uc, ud)), max(max(ua, ub), max(uc, ud))
+    least_v, most_v = min(min(va, vb), min(vc, vd)), max(max(va, vb), max(vc, vd))
+    area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
+    other = (uc - ud) * (vb - vd) - (ub - ud) * (vc - vd)
+    small = (most_u - least_u <= limit) & (most_v - least_v <= limit)
+    if not (
+        small
+        & (abs(area) >= 1e-12)
+        & (abs(other) >= 1e-12)
+        & (za + zb + zc + zd == za + zb + zc + zd)
+    ):
+        return False
+    for j in range(max(int(np.ceil(least_v)), 0), min(int(np.floor(most_v)), out.shape[0] - 1) + 1):
+        for i in range(
+            max(int(np.ceil(least_u)), 0), min(int(np.floor(most_u)), out.shape[1] - 1) + 1
+        ):
+            wb = ((i - ua) * (vc - va) - (uc - ua) * (j - va)) / area
+            wc = ((ub - ua) * (j - va) - (i - ua) * (vb - va)) / area
+            if wb >= -EDGE and wc >= -EDGE and wb + wc <= 1 + EDGE:
+                height = za + wb * (zb - za) + wc * (zc - za)
+                if not out[j, i] >= height:
+                    out[j, i] = height
+            wb = ((i - ud) * (vb - vd) - (ub - ud) * (j - vd)) / other
+            wc = ((uc - ud) * (j - vd) - (i - ud) * (vc - vd)) / other
+            if wb >= -EDGE and wc >= -EDGE and wb + wc <= 1 + EDGE:
+                height = zd + wb * (zc - zd) + wc * (zb - zd)
+                if not out[j, i] >= height:
+                    out[j, i] = height
+    return True
 
 
 @numba.njit(cache=True, nogil=True)
@@ -167,14 +217,13 @@ def _triangle(
     area = (u[b] - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (v[b] - v[a])
     if abs(area) < 1e-12:
         return
-    eps = 1e-9
     first_v, last_v = int(np.ceil(min(v[a], v[b], v[c]))), int(np.floor(max(v[a], v[b], v[c])))
     first_u, last_u = int(np.ceil(min(u[a], u[b], u[c]))), int(np.floor(max(u[a], u[b], u[c])))
     for j in range(max(first_v, 0), min(last_v, out.shape[0] - 1) + 1):
         for i in range(max(first_u, 0), min(last_u, out.shape[1] - 1) + 1):
             wb = ((i - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (j - v[a])) / area
             wc = ((u[b] - u[a]) * (j - v[a]) - (i - u[a]) * (v[b] - v[a])) / area
-            if wb >= -eps and wc >= -eps and wb + wc <= 1 + eps:
+            if wb >= -EDGE and wc >= -EDGE and wb + wc <= 1 + EDGE:
                 height = z[a] + wb * (z[b] - z[a]) + wc * (z[c] - z[a])
                 if not out[j, i] >= height:
                     out[j, i] = height
@@ -195,10 +244,14 @@ def save_png(path: str | Path, height: HeightMap) -> tuple[float, float]:
     """
     z = height.z_m
     there = np.isfinite(z)
-    low, high = (float(z[there].min()), float(z[there].max())) if there.any() else (0.0, 0.0)
+    low = float(z.min(where=there, initial=np.inf))
+    high = float(z.max(where=there, initial=-np.inf))
+    low, high = (low, high) if low <= high else (0.0, 0.0)
     scale = 65534.0 / (high - low) if high > low else 0.0
-    grey = np.zeros(z.shape, dtype=np.uint16)
-    grey[there] = np.rint((z[there].astype(np.float64) - low) * scale).astype(np.uint16) + 1
+    steps = np.where(there, z, low).astype(np.float64)
+    steps -= low
+    steps *= scale
+    grey = (np.rint(steps, out=steps).astype(np.uint16) + np.uint16(1)) * there
     _write(Path(path), grey)
     return low, high
 

@@ -6,7 +6,6 @@ shares the cloud's memory until it is published (rclpy serialises anything with 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -142,8 +141,6 @@ def report_to_msg(product: Product, stack: Stack) -> ScanReport:
     """Say what a stack gave: counts, figures and hashes (times and attempts are the node's)."""
     cloud = product.cloud
     rows, columns = cloud.points.shape
-    sigma = cloud.points["sigma"]
-    sigma = sigma[np.isfinite(sigma)]
     return ScanReport(
         scan_id=stack.scan_id,
         sequence=stack.sequence.name,
@@ -153,7 +150,7 @@ def report_to_msg(product: Product, stack: Stack) -> ScanReport:
         points=cloud.present,
         lit_positions=cloud.lit,
         refused=[RefusalCount(reason=r, count=n) for r, n in sorted(cloud.refused.items())],
-        median_sigma_m=float(np.median(sigma)) if sigma.size else math.nan,
+        median_sigma_m=cloud.median_sigma_m,
         edge_sigma_px=cloud.figures.edge_sigma_px,
         edge_bound_px=cloud.figures.edge_bound_px,
         edge_blur_px=cloud.figures.edge_blur_px,

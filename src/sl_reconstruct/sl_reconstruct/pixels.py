@@ -12,6 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from sl_reconstruct.bits import padded
+
 #: Distance over which a threshold is carried to pixels that saw only bright or only dark.
 CARRY_PX = 16
 #: Clean samples that go into a threshold; their count must fit above the sum.
@@ -29,7 +31,7 @@ class PixelRow(NamedTuple):
     ``ratio``: dark over bright level; ``unknown``: where it is not known, a byte each, seen as
     ``words`` too. ``bit``, ``clean``, ``parity``: a bit plane, where it is far from its edges,
     and the running parity. ``code``: division number. ``lit``: 1 where lit; ``clipped``: 1 where
-    saturated.
+    saturated; ``any_clipped``: whether any is.
     """
 
     low: NDArray[Any]
@@ -48,6 +50,7 @@ class PixelRow(NamedTuple):
     code: NDArray[np.uint16]
     lit: NDArray[np.uint8]
     clipped: NDArray[np.uint8]
+    any_clipped: NDArray[np.uint8]
 
 
 def pixel_row(width: int, dtype: Any) -> PixelRow:
@@ -56,11 +59,12 @@ def pixel_row(width: int, dtype: Any) -> PixelRow:
     words = np.zeros((width + 7) // 8, np.uint64)
     low, high, middle = (np.zeros(width, dtype) for _ in range(3))
     light, threshold, ratio = (np.zeros(width, np.float32) for _ in range(3))
-    bit, clean, parity, lit, clipped = (np.zeros(width, np.uint8) for _ in range(5))
+    bit, clean, parity, clipped = (np.zeros(width, np.uint8) for _ in range(4))
+    lit = padded(width, np.uint8)
     return PixelRow(
         low, high, middle, light, threshold, ratio, words, words.view(np.uint8),
         np.zeros(width, sums), np.zeros(width, sums), bit, clean, parity,
-        np.zeros(width, np.uint16), lit, clipped,
+        np.zeros(width, np.uint16), lit, clipped, np.zeros(1, np.uint8),
     )  # fmt: skip
 
 
@@ -222,16 +226,17 @@ def set_threshold(stack: Any, y: int, images: Any, reach: int, p: PixelRow) -> N
         _add(row, clean, shift, bright, dark)
     _mean(bright, shift, p.light)
     _mean(dark, shift, p.threshold)
-    missing = 0
+    missing = np.int32(0)
     threshold, light, ratio = p.threshold, p.light, p.ratio
     for x in range(threshold.size):
-        b, d = light[x], threshold[x]
-        ratio[x] = d / b
-        missing += np.isnan(d)
+        d = threshold[x]
+        ratio[x] = d / light[x]
+        missing |= np.int32(d != d)
     if missing:
         _carry(ratio, p.unknown, p.words)
         for x in range(threshold.size):
-            threshold[x] = light[x] * ratio[x] if np.isnan(threshold[x]) else threshold[x]
+            d = threshold[x]
+            threshold[x] = light[x] * ratio[x] if d != d else d
     for x in range(threshold.size):
         b, d = light[x], threshold[x]
         threshold[x] = (b + d) * np.float32(0.5)
@@ -246,17 +251,20 @@ def _fill_light(p: PixelRow) -> None:
     for x in range(light.size):
         a = light[x]
         plain = np.float32(high[x]) - np.float32(low[x])
-        light[x] = plain if np.isnan(a) else a
+        light[x] = plain if a != a else a
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def set_masks(p: PixelRow, lit_dn: float, saturation: int) -> None:
-    """Fill ``lit`` and ``clipped``."""
+    """Fill ``lit``, ``clipped`` and ``any_clipped``."""
     light, high, lit, clipped = p.light, p.high, p.lit, p.clipped
     for x in range(lit.size):
         lit[x] = np.uint8(light[x] >= np.float32(lit_dn))
+    found = np.uint8(0)
     for x in range(lit.size):
         clipped[x] = np.uint8(high[x] >= saturation)
+        found |= clipped[x]
+    p.any_clipped[0] = found
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -9,7 +9,19 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sl_reconstruct.edges import PRESENT
-from sl_reconstruct.geometry import Geometry, Rays, camera_rays, solve_points, solve_slopes
+from sl_reconstruct.geometry import (
+    DEPTH,
+    DZ,
+    PX,
+    PY,
+    PZ,
+    RAYS,
+    Array,
+    Geometry,
+    camera_rays,
+    solve_points,
+    solve_slopes,
+)
 from sl_reconstruct.reasons import Reason
 
 STEP = int(Reason.STEP)
@@ -41,47 +53,51 @@ class Screen(NamedTuple):
     wide_px: float
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _off(u: Any, before: Any, after: Any, limit: Any, bad: Any) -> None:
-    """Mark where ``u`` is not where two neighbours lead; before, after: (near, far)."""
-    for k in range(u.size):
-        d = u[k] - (2 * before[0][k] - before[1][k])
-        e = u[k] - (2 * after[0][k] - after[1][k])
-        bad[k] |= np.uint8(abs(d) > limit) | np.uint8(abs(e) > limit)
+class Around(NamedTuple):
+    """Scratch for one row: it and two rows on either side, with two NaN at both ends; marks."""
+
+    rows: NDArray[np.float32]
+    bad: NDArray[np.uint8]
+
+
+def around_row(n: int) -> Around:
+    """Return scratch for rows of n boundaries."""
+    return Around(np.full((5, n + 4), np.nan, np.float32), np.zeros(n, np.uint8))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _squeezed(u: Any, left: Any, right: Any, s: Screen, bad: Any) -> None:
-    """Mark where boundaries crowd: a wall that the camera does not see, blurred.
+def _compare(rows: Any, y: int, height: int, s: Screen, bad: Any) -> None:
+    """Mark a row's boundaries that are not where others lead: 1 is bad, 2 has few neighbours.
 
-    Mirrored images are compared with their signs exchanged.
+    Bad is what lies off the line through two neighbours on a side, in the row or the column; what
+    crowds its neighbours, as where a wall that the camera does not see is blurred (mirrored images
+    have their signs exchanged); and what the next rows hold elsewhere, or do not hold at all:
+    such a row runs along a wall or a shadow, and which side of it a pixel sees is not certain.
     """
-    sign = np.float32(1 if s.near_px > 0 else -1)
+    above, over, row, under, below = rows[0], rows[1], rows[2], rows[3], rows[4]
+    two, sign = np.float32(2), np.float32(1 if s.near_px > 0 else -1)
     near, wide = np.float32(abs(s.near_px)), np.float32(abs(s.wide_px))
-    for k in range(u.size):
-        a, b = sign * (u[k] - left[k]), sign * (right[k] - u[k])
-        bad[k] |= np.uint8(a < near) | np.uint8(b < near) | np.uint8(a + b < wide)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _apart(u: Any, other: Any, limit: float, bad: Any) -> None:
-    """Mark where another row has the boundary elsewhere."""
-    far = np.float32(limit)
-    for k in range(u.size):
-        bad[k] |= np.uint8(abs(other[k] - u[k]) > far)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _borders(u: Any, next_row: Any, limit: float, bad: Any) -> None:
-    """Mark where the next row holds nothing nearby, or another surface.
-
-    Such a row runs along a wall or a shadow: which side of it a pixel sees is not certain.
-    """
-    far = np.float32(limit)
-    for k in range(1, u.size - 1):
-        a, b, c = next_row[k - 1], next_row[k], next_row[k + 1]
-        nothing = (a != a) & (b != b) & (c != c)
-        bad[k] |= np.uint8(nothing) | np.uint8(abs(b - u[k]) > far)
+    jump, far = np.float32(s.jump_px), np.float32(ROW_JUMP * s.jump_px)
+    farther, inside = np.float32(2 * ROW_JUMP * s.jump_px), 2 <= y < height - 2
+    off_rows = jump if inside else np.float32(np.inf)
+    first, last = y == 0, y == height - 1
+    for k in range(bad.size):
+        u, left, right = row[k + 2], row[k + 1], row[k + 3]
+        up, down = over[k + 2], under[k + 2]
+        off = abs(u - (two * left - row[k])) > jump
+        off |= abs(u - (two * right - row[k + 4])) > jump
+        off |= abs(u - (two * up - above[k + 2])) > off_rows
+        off |= abs(u - (two * down - below[k + 2])) > off_rows
+        a, b = sign * (u - left), sign * (right - u)
+        off |= (a < near) | (b < near) | (a + b < wide)
+        off |= (abs(up - u) > far) | (abs(down - u) > far)
+        off |= (abs(above[k + 2] - u) > farther) | (abs(below[k + 2] - u) > farther)
+        none_up = (over[k + 1] != over[k + 1]) & (up != up) & (over[k + 3] != over[k + 3])
+        none_down = (under[k + 1] != under[k + 1]) & (down != down) & (under[k + 3] != under[k + 3])
+        off |= (none_up & (not first)) | (none_down & (not last))
+        pairs = (left + row[k]) + (right + row[k + 4])
+        lonely = (pairs != pairs) & (u == u)
+        bad[k] = np.uint8(1) if off else np.uint8(2 * lonely)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -107,11 +123,7 @@ def _lonely(u: Any, s: Screen, bad: Any) -> None:
     n = u.size
     sign, near = 1.0 if s.near_px > 0 else -1.0, abs(s.near_px)
     for k in range(n):
-        if bad[k] or np.isnan(u[k]):
-            continue
-        left = k >= 2 and u[k - 1] + u[k - 2] == u[k - 1] + u[k - 2]
-        right = k < n - 2 and u[k + 1] + u[k + 2] == u[k + 1] + u[k + 2]
-        if left and right:
+        if bad[k] != 2:
             continue
         a, pace_a, has_a = _side(u, k, -1)
         b, pace_b, has_b = _side(u, k, 1)
@@ -122,48 +134,36 @@ def _lonely(u: Any, s: Screen, bad: Any) -> None:
         near_by = 0
         for j in range(max(0, k - 2), min(n, k + 3)):
             near_by += u[j] == u[j]
-        if off or crowd or has_a + has_b < 2 or near_by < 2:
-            bad[k] = 1
+        bad[k] = off or crowd or has_a + has_b < 2 or near_by < 2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def find_steps(u_px: Any, y: int, s: Screen, bad: Any) -> None:
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def find_steps(u_px: Any, y: int, s: Screen, around: Around) -> None:
     """Mark boundaries of row y that are not where their neighbours in row and column lead."""
-    u = u_px[y]
-    n, rows = u.size, u_px.shape[0]
-    limit = np.float32(s.jump_px)
-    bad[:] = 0
-    _squeezed(u[1 : n - 1], u[: n - 2], u[2:], s, bad[1 : n - 1])
-    mid = u[2 : n - 2]
-    _off(mid, (u[1 : n - 3], u[: n - 4]), (u[3 : n - 1], u[4:]), limit, bad[2 : n - 2])
-    if 2 <= y < rows - 2:
-        _off(u, (u_px[y - 1], u_px[y - 2]), (u_px[y + 1], u_px[y + 2]), limit, bad)
-    for step in (-1, 1):
-        if 0 <= y + step < rows:
-            _borders(u, u_px[y + step], ROW_JUMP * s.jump_px, bad)
-        if 0 <= y + 2 * step < rows:
-            _apart(u, u_px[y + 2 * step], 2 * ROW_JUMP * s.jump_px, bad)
-    _lonely(u, s, bad)
+    height, n = u_px.shape
+    for i in range(5):
+        row = around.rows[i, 2 : n + 2]
+        if 0 <= y + i - 2 < height:
+            source = u_px[y + i - 2]
+            for k in range(n):
+                row[k] = source[k]
+        else:
+            row[:] = np.float32(np.nan)
+    _compare(around.rows, y, height, s, around.bad)
+    _lonely(u_px[y], s, around.bad)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _row(g: Geometry, y: int, columns: Any, lines: Any, bad: Any, r: Rays, out: Output) -> None:
-    u, reason, values = out.u_px[y], out.reason[y], out.values[y]
-    found, sigma_px, level = lines.reason[y], lines.sigma_px[y], lines.level_dn[y]
-    for k in range(u.size):
-        u[k] = np.float32(np.nan) if bad[k] else lines.u_px[y, k]
-        reason[k] = np.uint8(STEP) if bad[k] and found[k] == PRESENT else found[k]
-    camera_rays(g, u, float(y), r)
-    solve_slopes(g, columns, r)
-    solve_points(g, r)
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _write(r: Array, sigma_px: Any, level: Any, values: Any, u: Any, reason: Any) -> None:
+    """Write the solved part of a row; NaN where there is no point."""
     nan = np.float32(np.nan)
     for k in range(u.size):
-        if reason[k] == PRESENT and r.depth[k] > 0:
-            values[k, 0] = r.px[k]
-            values[k, 1] = r.py[k]
-            values[k, 2] = r.pz[k]
+        if reason[k] == PRESENT and r[DEPTH + k] > 0:
+            values[k, 0] = r[PX + k]
+            values[k, 1] = r[PY + k]
+            values[k, 2] = r[PZ + k]
             values[k, 3] = level[k]
-            values[k, 4] = abs(r.dz[k]) * sigma_px[k]
+            values[k, 4] = abs(r[DZ + k]) * sigma_px[k]
             continue
         if reason[k] == PRESENT:
             reason[k] = GEOMETRY
@@ -172,12 +172,33 @@ def _row(g: Geometry, y: int, columns: Any, lines: Any, bad: Any, r: Rays, out: 
             values[k, i] = nan
 
 
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _row(g: Geometry, y: int, columns: Any, lines: Any, bad: Any, r: Array, out: Output) -> None:
+    u, reason, values = out.u_px[y], out.reason[y], out.values[y]
+    found, sigma_px, level, at = (
+        lines.reason[y],
+        lines.sigma_px[y],
+        lines.level_dn[y],
+        lines.u_px[y],
+    )
+    nan = np.float32(np.nan)
+    for k in range(u.size):
+        u[k] = nan if bad[k] else at[k]
+        reason[k] = np.uint8(STEP) if (bad[k] != 0) & (found[k] == PRESENT) else found[k]
+    for a in range(0, u.size, RAYS):
+        b = min(a + RAYS, u.size)
+        camera_rays(g, u[a:b], float(y), r)
+        solve_slopes(g, columns[a:b], r)
+        solve_points(g, b - a, r)
+        _write(r, sigma_px[a:b], level[a:b], values[a:b], u[a:b], reason[a:b])
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def triangulate_rows(
     first: int, last: int, g: Geometry, columns: Any, lines: Any, screen: Screen, out: Output,
-    r: Rays, bad: Any,
+    r: Array, around: Around,
 ) -> None:  # fmt: skip
     """Screen and triangulate rows first to last. columns: observed DMD column of each boundary."""
     for y in range(first, last):
-        find_steps(lines.u_px, y, screen, bad)
-        _row(g, y, columns, lines, bad, r, out)
+        find_steps(lines.u_px, y, screen, around)
+        _row(g, y, columns, lines, around.bad, r, out)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sl_projector.errors import StackError
-from sl_reconstruct.cloud import Cloud
+from sl_reconstruct.cloud import Cloud, median
 
 #: A good scan has this part of its lit positions; where the finest stripes drown in moire, half
 #: of the boundaries may be missing.
@@ -56,18 +56,13 @@ def verdict(cloud: Cloud) -> tuple[bool, list[str]]:
 def _missing_rays(cloud: Cloud) -> list[str]:
     if cloud.gap_px is None or cloud.gap_m is None or not np.isfinite(cloud.gap_m).any():
         return []
-    gap_px, gap_m = _median(cloud.gap_px), _median(cloud.gap_m)
+    gap_px, gap_m = median(cloud.gap_px), median(cloud.gap_m)
     if gap_px <= MAX_GAP_PX:
         return []
     return [
         f"camera and projector rays miss each other by {gap_m * 1e3:.3g} mm ({gap_px:.3g} px, "
         f"median); expected at most {MAX_GAP_PX:g} px: the calibration does not fit the images"
     ]
-
-
-def _median(values: NDArray[np.float32]) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else float("nan")
 
 
 def check_identity(tally: NDArray[np.int32], images: list[int]) -> None:
@@ -103,6 +98,9 @@ def in_order(u_px: NDArray[np.float32]) -> float:
     u = u_px[np.isfinite(u_px)]
     if u.size < 16:
         return float("nan")
+    steps = np.diff(u)
+    if (steps > 0).all() or (steps < 0).all():
+        return 1.0
     return max(_longest_rise(u), _longest_rise(u[::-1])) / u.size
 
 

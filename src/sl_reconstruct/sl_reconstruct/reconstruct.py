@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -17,9 +18,9 @@ from sl_reconstruct.crossed import Crossed, cross_rows, map_rows
 from sl_reconstruct.edges import Filter, Tuning
 from sl_reconstruct.filters import edge_filter, gaussian_taps, tap_variance
 from sl_reconstruct.full_scale import saturation_of
-from sl_reconstruct.geometry import geometry, ray_row
+from sl_reconstruct.geometry import geometry, ray_tile
 from sl_reconstruct.plan import AxisPlan, DecodePlan
-from sl_reconstruct.points import Output, Screen, triangulate_rows
+from sl_reconstruct.points import Output, Screen, around_row, triangulate_rows
 from sl_reconstruct.quality import check_identity, check_order, check_phase
 from sl_reconstruct.rig import Rig
 from sl_reconstruct.rows import Layout, Lines, decode_rows, row_scratch
@@ -139,7 +140,7 @@ class Reconstructor:
         screen = _screen(self.settings, figures)
 
         def work(first: int, last: int) -> None:
-            scratch = ray_row(column.size_px), np.zeros(column.size_px, np.uint8)
+            scratch = ray_tile(), around_row(column.size_px)
             triangulate_rows(first, last, self._geometry, columns, lines, screen, out, *scratch)
 
         share_rows(work, stack.shape[1])
@@ -154,8 +155,9 @@ class Reconstructor:
         saturation: int,
     ) -> Crossed:  # fmt: skip
         """Decode the rows, and solve again with all four equations."""
-        plan, white, black, turned = turn(self.plan, stack)
-        state, across, figures = self._decode(turned, plan, white, black, saturation)
+        plan, white, black = turn(self.plan)
+        images = self.plan.row.images if self.plan.row else ()
+        state, across, figures = self._decode(stack, plan, white, black, saturation, images)
         t = state.tuning
         sigma_v = float(np.nanmedian(across.sigma_px)) / t.scale
         v_map = np.empty((stack.shape[2], stack.shape[1]), np.float32)
@@ -163,7 +165,7 @@ class Reconstructor:
         screen, gap_px = _screen(self.settings, figures), self.settings.max_gap_px or np.inf
 
         def work_rows(first: int, last: int) -> None:
-            map_rows(first, last, across, screen, v_map, np.zeros(plan.size_px, np.uint8))
+            map_rows(first, last, across, screen, v_map, around_row(plan.size_px))
 
         def work(first: int, last: int) -> None:
             cross_rows(first, last, self._geometry, columns, lines, sigma_v, gap_px, out, add)
@@ -173,19 +175,26 @@ class Reconstructor:
         return add
 
     def _decode(
-        self, stack: NDArray[Any], plan: AxisPlan, white: int, black: int, saturation: int
-    ) -> tuple[AxisState, Lines, Figures]:
+        self, stack: NDArray[Any], plan: AxisPlan, white: int, black: int, saturation: int,
+        across: tuple[int, ...] = (),
+    ) -> tuple[AxisState, Lines, Figures]:  # fmt: skip
+        """Decode image rows, or the columns of the images ``across``."""
         layout = make_layout(plan, white, black)
-        ys = survey_rows(stack.shape[1])
+        count = stack.shape[2] if across else stack.shape[1]
+        ys, rows = survey_rows(count), np.arange(count)
         few = self._lines((ys.size, plan, "survey"))
-        state = survey(stack, ys, plan, layout, self.settings, few, saturation)
-        lines = self._lines((stack.shape[1], plan, "all"))
-        rows = np.arange(stack.shape[1])
-        arguments = (stack, layout, state.edge_filter, state.tuning, state.bars, lines)
+        surveyed = (turned(stack, across, ys), rows[: ys.size]) if across else (stack, ys)
+        state = survey(*surveyed, plan, layout, self.settings, few, saturation)
+        lines = self._lines((count, plan, "all"))
+        arguments = layout, state.edge_filter, state.tuning, state.bars, lines
+        divisions = -(-plan.size_px // plan.division_px)
 
         def work(first: int, last: int) -> None:
-            scratch = row_scratch(stack.shape[2], stack.dtype, -(-plan.size_px // plan.division_px))
-            decode_rows(rows, first, last, *arguments, scratch)
+            part, at = stack, rows
+            if across:
+                part, at = turned(stack, across, slice(first, last)), rows - first
+            scratch = row_scratch(part.shape[2], stack.dtype, divisions)
+            decode_rows(at, first, last, part, *arguments, scratch)
 
         share_rows(work, rows.size)
         images = [s.image for s in plan.sources]
@@ -225,24 +234,32 @@ def _output(height: int, boundaries: int) -> Output:
     )
 
 
-def turn(plan: DecodePlan, stack: NDArray[Any]) -> tuple[AxisPlan, int, int, NDArray[Any]]:
-    """The row plan's images transposed, and the plan, white and black renumbered to match."""
+def turned(
+    stack: NDArray[Any], images: tuple[int, ...], columns: slice | NDArray[np.int64]
+) -> NDArray[Any]:
+    """Camera columns of some images as rows: a few at a time, a whole stack would fill memory."""
+    parts = [stack[image][:, columns] for image in images]
+    rows = np.empty((len(images), parts[0].shape[1], stack.shape[1]), stack.dtype)
+    for part, row in zip(parts, rows, strict=True):
+        cv2.transpose(part, row)
+    return rows
+
+
+def turn(plan: DecodePlan) -> tuple[AxisPlan, int, int]:
+    """The row plan, white and black as for a stack of the row plan's images alone."""
     assert plan.row is not None
-    images = plan.row.images
-    turned = np.empty((len(images), stack.shape[2], stack.shape[1]), stack.dtype)
-    for i, image in enumerate(images):
-        cv2.transpose(stack[image], turned[i])
-    at = {image: i for i, image in enumerate(images)} | {-1: -1}
+    at = {image: i for i, image in enumerate(plan.row.images)} | {-1: -1}
     row = replace(
-        plan.row, images=tuple(range(len(images))),
+        plan.row, images=tuple(range(len(plan.row.images))),
         bits=tuple(replace(b, image=at[b.image], inverse=at[b.inverse]) for b in plan.row.bits),
         sources=tuple(
             replace(s, image=at[s.image], inverse=at[s.inverse]) for s in plan.row.sources
         ),
     )  # fmt: skip
-    return row, at[plan.white], at[plan.black], turned
+    return row, at[plan.white], at[plan.black]
 
 
+@functools.lru_cache(maxsize=8)
 def make_layout(plan: AxisPlan, white: int, black: int) -> Layout:
     """Write an axis's plan as arrays for the kernels."""
     edge_owner, centre_owner = plan.owners()

@@ -9,20 +9,29 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sl_reconstruct.edges import (
-    IDENTITY,
+    FRACTION,
     PRESENT,
     SATURATION,
-    SHAPE,
+    SIGMA,
+    TILE,
     UNLIT,
+    WHY,
+    WIDTH,
     Filter,
     Found,
+    K,
     SourceRow,
     Tuning,
     bar_centres,
     check_light,
     find_crossings,
     find_zeros,
+    gather,
+    gather_pair,
+    gather_single,
     identify,
+    judge,
+    look_up_gain,
     pair_signal,
     single_signal,
     smooth,
@@ -95,88 +104,77 @@ def decode_pixels(stack: Any, y: int, plan: Layout, t: Tuning, p: PixelRow) -> N
     set_masks(p, t.lit_dn, t.saturation)
 
 
-# Inner loops call no function that takes an array: numba would count references for each call.
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _judge(r: SourceRow, count: int, least: float, most: float, tally: Any) -> None:
-    """Refuse crossings of another shape than the blur makes, or whose identity disagrees."""
-    width, fraction, agreed, why = r.width, r.fraction, r.agreed, r.why
-    low, high = np.float32(least), np.float32(most)
-    first, last = np.float32(-0.5), np.float32(1.5)
-    accepted = confused = 0
-    for i in range(count):
-        shaped = (width[i] >= low) & (width[i] <= high)
-        shaped &= (fraction[i] >= first) & (fraction[i] <= last)
-        reason = why[i] if why[i] != 0 else np.uint8(0 if shaped else SHAPE)
-        doubt = (reason == 0) & (agreed[i] == 0)
-        why[i] = np.uint8(IDENTITY) if doubt else reason
-        confused += doubt
-        accepted += why[i] == 0
-    tally[0] += accepted
-    tally[1] += confused
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _settle(owner: Any, s: int, r: SourceRow, count: int, out: Found) -> None:
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _settle(owner: Any, s: int, r: SourceRow, first: int, n: int, out: Found) -> None:
     """Write each crossing where it belongs; a boundary found twice is in doubt, and refused."""
-    at, fraction, width, sigma, ks, why = r.at, r.fraction, r.width, r.sigma, r.k, r.why
+    at, tile = r.at[first : first + n], r.tile
     u_px, sigma_px, width_px, reasons = out.u_px, out.sigma_px, out.width_px, out.reason
-    for i in range(count):
-        k = np.int64(ks[i])
-        if k <= 0 or owner[k] != s:
+    for i in range(n):
+        k, why = np.uint64(tile[K + i]), np.uint8(tile[WHY + i])
+        if k == 0 or owner[k] != s:
             continue
         before = reasons[k]
         if before in (PRESENT, ORDER):
-            if why[i] == 0:
+            if why == 0:
                 reasons[k] = ORDER
                 u_px[k] = np.nan
             continue
-        reasons[k] = why[i]
-        if why[i] == 0:
-            u_px[k] = at[i] + fraction[i]
-            sigma_px[k] = sigma[i]
-            width_px[k] = width[i]
+        reasons[k] = why
+        if why == 0:
+            u_px[k] = np.int64(at[i]) + tile[FRACTION + i]
+            sigma_px[k] = tile[SIGMA + i]
+            width_px[k] = tile[WIDTH + i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _edges(
     s: int, pattern: Any, inverse: Any, plan: Layout, f: Filter, t: Tuning, p: PixelRow,
     r: SourceRow, out: Found, tally: Any,
 ) -> None:  # fmt: skip
     """Find and identify the edges of one source."""
     margin = f.taps.shape[1] + t.reach_px  # neither filter nor threshold reach beyond the image
-    count = find_crossings(p.lit, r, margin, r.filtered.size - margin - 1)
-    find_zeros(r.filtered, r.at, count, r.fraction, r.slope)
-    identify(p.code, r, count, plan.sources[s, 3], plan.sources[s, 2], False, t)
-    check_light(p.light, p.clipped, r.at, count, t, r.why)
-    if plan.sources[s, 1] >= 0:
-        weigh_pairs(pattern, inverse, p.light, f.gain[s], f.slope[s], t, r, count)
-    else:
-        weigh_singles(p, f.gain[s], f.slope[s], False, t, r, count)
-    _judge(r, count, t.least_width, t.most_width, tally)
-    _settle(plan.edge_owner, s, r, count, out)
+    count = find_crossings(p.lit, r.filtered, r.at, margin, r.filtered.size - margin - 1)
+    pair, tile = plan.sources[s, 1] >= 0, r.tile
+    for first in range(0, count, TILE):
+        n = min(TILE, count - first)
+        gather(p, r, first, n, t)
+        find_zeros(tile, n)
+        identify(tile, n, plan.sources[s, 3], plan.sources[s, 2], False, t)
+        check_light(tile, n, t)
+        look_up_gain(tile, n, f.gain[s])
+        if pair:
+            gather_pair(pattern, inverse, r, first, n)
+            weigh_pairs(tile, n, f.slope[s], t)
+        else:
+            gather_single(p, r, first, n)
+            weigh_singles(tile, n, f.slope[s], False, t)
+        judge(tile, n, t.least_width, t.most_width, tally)
+        _settle(plan.edge_owner, s, r, first, n, out)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _bars(
     s: int, plan: Layout, f: Filter, t: Tuning, p: PixelRow, r: SourceRow, out: Found, tally: Any
 ) -> None:
     """Find and identify the centres of one source by BR8's zero crossings, Eq. (6)."""
     margin = 5 + t.reach_px
-    count = find_crossings(p.lit, r, margin, r.filtered.size - margin - 1)
-    find_zeros(r.filtered, r.at, count, r.fraction, r.slope)
-    half = plan.sources[s, 2]
-    # left of a bright centre the left samples are the darker ones, whichever way k grows
-    identify(p.code, r, count, plan.sources[s, 3] + half, half, t.direction < 0, t)
-    check_light(p.light, p.clipped, r.at, count, t, r.why)
-    last = f.slope.size - 1
-    weigh_singles(p, f.gain[last], f.slope[last], True, t, r, count)
-    _judge(r, count, t.least_width / BAR_LATITUDE, BAR_LATITUDE * t.most_width, tally)
-    _settle(plan.centre_owner, s, r, count, out)
+    count = find_crossings(p.lit, r.filtered, r.at, margin, r.filtered.size - margin - 1)
+    half, last, tile = plan.sources[s, 2], f.slope.size - 1, r.tile
+    for first in range(0, count, TILE):
+        n = min(TILE, count - first)
+        gather(p, r, first, n, t)
+        find_zeros(tile, n)
+        # left of a bright centre the left samples are the darker ones, whichever way k grows
+        identify(tile, n, plan.sources[s, 3] + half, half, t.direction < 0, t)
+        check_light(tile, n, t)
+        look_up_gain(tile, n, f.gain[last])
+        gather_single(p, r, first, n)
+        weigh_singles(tile, n, f.slope[last], True, t)
+        judge(tile, n, t.least_width / BAR_LATITUDE, BAR_LATITUDE * t.most_width, tally)
+        _settle(plan.centre_owner, s, r, first, n, out)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _source(
     stack: Any, y: int, s: int, plan: Layout, f: Filter, t: Tuning, p: PixelRow, r: SourceRow,
     out: Found, tally: Any, bars: bool,
@@ -269,15 +267,26 @@ def _levels(p: PixelRow, dynamic: bool, out: Found) -> None:
     u_px, level_dn, threshold, light, high = out.u_px, out.level_dn, p.threshold, p.light, p.high
     for k in range(u_px.size):
         if u_px[k] == u_px[k]:
-            x = int(u_px[k] + np.float32(0.5))
+            x = np.uint64(u_px[k] + np.float32(0.5))
             level_dn[k] = threshold[x] + np.float32(0.5) * light[x] if dynamic else high[x]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _see(p: PixelRow, seen: Any, blind: Any) -> None:
-    """Count the lit pixels of each division, and mark divisions lost in saturation."""
-    seen[:] = 0
-    blind[:] = 0
+def _lit_divisions(p: PixelRow) -> tuple[int, int]:
+    """First and last division among the lit pixels; the last is less where none is lit."""
+    code, lit = p.code, p.lit
+    low, high, most = np.uint16(0xFFFF), np.uint16(0), np.uint16(0xFFFF)
+    for x in range(code.size):
+        a = code[x] if lit[x] else most
+        b = code[x] if lit[x] else np.uint16(0)
+        low = a if a < low else low
+        high = b if b > high else high
+    return int(low), int(high)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lose(p: PixelRow, divisions: int, blind: Any) -> None:
+    """Mark divisions lost in saturation: those between lit pixels with clipped ones between."""
     last, gap = -1, 0
     code, lit, clipped = p.code, p.lit, p.clipped
     for x in range(code.size):
@@ -285,9 +294,8 @@ def _see(p: PixelRow, seen: Any, blind: Any) -> None:
             gap += clipped[x]
             continue
         q = int(code[x])
-        if q >= seen.size:
+        if q >= divisions:
             continue
-        seen[q] += 1
         if gap and last >= 0:
             for i in range(min(last, q) + 1, max(last, q)):
                 blind[i] = 1
@@ -295,10 +303,34 @@ def _see(p: PixelRow, seen: Any, blind: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _account(plan: Layout, seen: Any, blind: Any, division_px: int, reason: Any) -> None:
+def _see(p: PixelRow, seen: Any) -> None:
+    """Mark divisions by their lit pixels: 1 where there is one, 3 where there are more."""
+    code, lit = p.code, p.lit
+    for x in range(code.size):
+        q = np.uint64(code[x])
+        if lit[x] and q < seen.size:
+            seen[q] = 3 if seen[q] else 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _account(
+    plan: Layout, p: PixelRow, seen: Any, blind: Any, division_px: int, reason: Any
+) -> None:
     """Name the boundaries that should be there, but were not found."""
     edge_owner, centre_owner = plan.edge_owner, plan.centre_owner
-    for k in range(reason.size):
+    low, high = _lit_divisions(p)
+    first, last = max(1, low * division_px), min(reason.size, (high + 1) * division_px)
+    unfound = 0
+    for k in range(first, last):
+        unfound += reason[k] == UNLIT
+    if not unfound:
+        return
+    seen[:] = 0
+    blind[:] = 0
+    _see(p, seen)
+    if p.any_clipped[0]:
+        _lose(p, seen.size, blind)
+    for k in range(first, last):
         if reason[k] != UNLIT or (edge_owner[k] < 0 and centre_owner[k] < 0):
             continue
         if seen[k // division_px] > 1:
@@ -326,8 +358,7 @@ def _row(
             _average_centres(plan, found)
         _check_centres(plan, t, found)
     _levels(p, plan.dynamic, found)
-    _see(p, seen, blind)
-    _account(plan, seen, blind, t.division_px, found.reason)
+    _account(plan, p, seen, blind, t.division_px, found.reason)
 
 
 class RowScratch(NamedTuple):
@@ -335,7 +366,7 @@ class RowScratch(NamedTuple):
 
     pixels: PixelRow
     source: SourceRow
-    seen: NDArray[np.int32]
+    seen: NDArray[np.uint8]
     blind: NDArray[np.uint8]
 
 
@@ -343,7 +374,7 @@ def row_scratch(width: int, dtype: Any, divisions: int) -> RowScratch:
     """Return scratch for rows of ``width`` pixels and a code of so many divisions."""
     return RowScratch(
         pixel_row(width, dtype), source_row(width),
-        np.zeros(divisions, np.int32), np.zeros(divisions, np.uint8),
+        np.zeros(divisions, np.uint8), np.zeros(divisions, np.uint8),
     )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from sl_projector import kernel_cache
 from sl_projector.errors import CalibrationError
 from sl_projector.sequence import Pattern, PatternSequence, named
 from sl_reconstruct.calibration_file import Calibration
-from sl_reconstruct.cloud import Cloud
+from sl_reconstruct.cloud import Cloud, median
 from sl_reconstruct.reconstruct import Reconstructor
 from sl_reconstruct.rig import Device, Division, Rig
 from sl_reconstruct.settings import Settings
@@ -111,7 +111,10 @@ def warm_up(rest: bool = False) -> None:
     for name, dtype in kinds or [("precise", np.uint8)]:
         sequence = named(name, _TINY_DMD)
         stack = np.zeros((len(sequence), *_TINY_CAMERA[::-1]), dtype)
-        Reconstructor(tiny_rig(), sequence)(stack)
+        cloud = Reconstructor(tiny_rig(), sequence)(stack)
+        for values in (cloud.points["sigma"], cloud.gap_m):
+            if values is not None:
+                median(values)
     with contextlib.suppress(OSError):
         _mark(rest).touch()
 
