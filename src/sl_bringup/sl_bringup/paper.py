@@ -7,6 +7,7 @@ is the projection, the decoding and the triangulation, not the calibration.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -46,11 +47,18 @@ FLANKS = (Region.rectangle(-2.8e-3, -4e-3, -0.2e-3, 4e-3),
           Region.rectangle(0.2e-3, -4e-3, 2.8e-3, 4e-3))  # fmt: skip
 #: Fig. 11: 3.5 x 3.5 mm of the coin with its topmost character, and a section through that.
 CHARACTER = Region.rectangle(-1.75e-3, 0.9e-3, 1.75e-3, 4.4e-3)
+CHARACTER_MM2 = 3.5 * 3.5
 SECTION = ((-0.85e-3, 2.8e-3), (0.85e-3, 2.8e-3))
 #: About one camera row.
 SECTION_WIDTH_M = 8e-6
 #: Table 2 and section 4.3: points, area (mm), standard deviation (um), angle, seconds.
-PAPER = {"points": 1_077_582, "area": (12.0, 9.0), "sd_um": 3.817, "angle": 152.49, "time_s": 120.0}
+PAPER: dict[str, Any] = {
+    "points": 1_077_582,
+    "area": (12.0, 9.0),
+    "sd_um": 3.817,
+    "angle": 152.49,
+    "time_s": 120.0,
+}
 PAPER_PLANES = ("Z = -0.2265 X +0.0016 Y", "Z = +0.2621 X +0.0013 Y")
 PAPER_COIN = {"points": 137_033, "height_um": 50.0}
 #: Gray code alone: I1-I8, 256 divisions of 4 DMD columns.
@@ -211,15 +219,21 @@ def _groove(folder: Path) -> dict[str, Any]:
 def _coin(folder: Path) -> dict[str, Any]:
     """Fig. 11."""
     say("\nCoin: Fig. 11, 3.5 x 3.5 mm with a character")
-    say(_line("", ["points", "height of the section", "time"]))
-    say(_line("the paper's", [f"{PAPER_COIN['points']:,}", f"about {PAPER_COIN['height_um']} µm"]))
+    say(_line("", ["points", "points per mm²", "height of the section", "time"]))
+    theirs = PAPER_COIN["points"]
+    height = f"about {PAPER_COIN['height_um']} µm"
+    say(_line("the paper's", [f"{theirs:,}", f"{theirs / CHARACTER_MM2:,.0f}", height]))
+    # Its groove's density says what this rig's paper twin gives on that area at most.
+    groove = PAPER["points"] / math.prod(PAPER["area"])
+    say(_line("  at its groove's", [f"{groove * CHARACTER_MM2:,.0f}", f"{groove:,.0f}"]))
     results, sections = {}, []
     for name in ("paper", "precise"):
         row, _ = scan("coin", name)
         character = select(row.points, CHARACTER)
         section: ProfileMeasurement = measure_profile(row.points, *SECTION, SECTION_WIDTH_M)
         height = f"{1e6 * section.value:.2f} ± {1e6 * section.uncertainty:.2f} µm"
-        say(_line(name, [f"{len(character):,}", height, f"{row.time_s:.2f} s"]))
+        density = f"{len(character) / CHARACTER_MM2:,.0f}"
+        say(_line(name, [f"{len(character):,}", density, height, f"{row.time_s:.2f} s"]))
         inside = CHARACTER.contains(row.points["x"], row.points["y"])
         part = row.points.copy()
         for axis in "xyz":
