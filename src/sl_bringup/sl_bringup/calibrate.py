@@ -147,7 +147,9 @@ def _plate_on_bench(config: Path, options: GraphOptions) -> dict[str, Any]:
     section = document.get(f"{options.changes.namespace}/calibration", {})
     parameters = section.get("ros__parameters", {})
     names = ("columns", "rows", "pitch_m", "diameter_m", "chamfer_m", "origin_diameter_m")
-    return {n: parameters[f"plate_{n}"] for n in names if f"plate_{n}" in parameters}
+    found = {n: parameters[f"plate_{n}"] for n in names if f"plate_{n}" in parameters}
+    mark = [f"plate_origin_{axis}" for axis in ("column", "row")]
+    return found | ({"origin_id": [parameters[n] for n in mark]} if mark[0] in parameters else {})
 
 
 def run(args: argparse.Namespace) -> int:
