@@ -127,6 +127,25 @@ def test_uneven_light_does_not_move_centres():
     assert np.abs(errors_px(world, view)[view.good]).max() < LIMIT_PX
 
 
+@pytest.mark.parametrize(
+    ("uneven", "chamfer_m", "limit_px"), [(0.05, 0.0, 7e-4), (0.7, 0.0, 7e-4), (0.7, 1e-4, 3e-3)]
+)
+def test_without_noise_centres_are_the_truth(uneven, chamfer_m, limit_px):
+    """The truth is the true camera's projection; 30 % of the light are left at the corners.
+
+    Plain holes: four sigma of the bench's raster (0.00015 px). Chamfers: the model takes a slope's
+    light as that of one cone and the rims' images as alike, which leaves 0.002 px at this width.
+    """
+    part = make_surface("hole_plate", chamfer_m=chamfer_m, origin_diameter_m=0)
+    world = World(reference_rig(), part, Optics(uneven_light=uneven))
+    world.move(np.eye(3), [0.0, 0.0, chamfer_m])  # the holes' bottoms at z = 0
+    electrons = world.electrons_per_second(WHITE[0][0]) + world.ambient_e_per_s()
+    view = find_plate(electrons / electrons.max() * 200, Plate(chamfer_m=chamfer_m))
+    assert len(view.ids) == 100 and view.good.all()
+    true = world.rig.camera.project(np.pad(view.plate_xy_m, ((0, 0), (0, 1))))
+    assert np.abs(view.centres_px - true).max() < limit_px
+
+
 def test_saturation_is_said_and_priced():
     # The middle of the plate is saturated, its border is not.
     world = World(reference_rig(), make_surface("hole_plate"), Optics(white_dn=250.0, seed=1))

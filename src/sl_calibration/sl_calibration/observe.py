@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,16 +17,23 @@ from sl_projector.sequence import Pattern, PatternSequence
 from sl_reconstruct.correspondence import Correspondences, correspondences
 from sl_reconstruct.full_scale import full_scale_dn
 
+Array = NDArray[np.float64]
+
 #: White must differ from black by this part of the full scale in some part of the image.
 MIN_LIGHT = 0.05
 #: The part of the image that must be lit so.
 MIN_LIT_PART = 0.02
 #: Fewer targets than this in a view do not carry a projector's calibration.
 MIN_TARGETS = 30
-#: Added in quadrature to a target's sigma, DMD pixels. Light that falls by 1e-4 a pixel and the
-#: camera's slant move the edges by 1e-4 px, alike over whole regions of the field: such errors do
-#: not average out, and each of the hundreds of targets has to count for less to make up for it.
-MODEL_SIGMA_PX = 0.001
+#: Light with a relative slope g moves an edge blurred by s by some s^2 g, alike over whole regions
+#: of the field: that does not average out, so each of the hundreds of targets has to count for less
+#: to make up for it. 1.5 px^2 as measured on noise-free images, times the root of 50 a region.
+LIGHT_SLOPE_PX2 = 10.0
+#: What is left in even light, DMD pixels.
+MODEL_SIGMA_PX = 0.0003
+#: The light is looked at in cells of so many pixels, smoothed over so many cells.
+CELL_PX = 8
+SMOOTH_CELLS = 6.0
 _NO_TARGETS = Correspondences(*np.empty((3, 0, 2)))
 
 
@@ -42,8 +50,9 @@ def observe(taken: Taken, order: Order) -> View:
     """
     check_light(taken.images, taken.sequence)
     full_dn = full_scale_dn(taken.images)
-    holes = find_plate(white_image(taken.images, taken.sequence), order.plate, full_dn)
-    targets = _targets(taken) if order.patterns else _NO_TARGETS
+    white = white_image(taken.images, taken.sequence)
+    holes = find_plate(white, order.plate, full_dn)
+    targets = _targets(taken, white) if order.patterns else _NO_TARGETS
     good = holes.good
     return View(
         taken.height_m,
@@ -52,14 +61,30 @@ def observe(taken: Taken, order: Order) -> View:
     )  # fmt: skip
 
 
-def _targets(taken: Taken) -> Correspondences:
+def _targets(taken: Taken, white: NDArray[np.float32]) -> Correspondences:
     found = correspondences(taken.images, taken.sequence)
     if len(found) < MIN_TARGETS:
         raise CalibrationError(
             f"the projector's coordinates were decoded at {len(found)} places; expected at least "
             f"{MIN_TARGETS}: is the plate in focus and evenly lit, and the exposure right?"
         )
-    return replace(found, sigma_px=np.hypot(found.sigma_px, MODEL_SIGMA_PX))
+    spread = np.std(found.dmd_px, axis=0) / np.std(found.camera_px, axis=0)
+    moved = LIGHT_SLOPE_PX2 * light_slope(white, found.camera_px) * float(spread.max())
+    model = np.hypot(moved, MODEL_SIGMA_PX)[:, np.newaxis]
+    return replace(found, sigma_px=np.hypot(found.sigma_px, model))
+
+
+def light_slope(white: NDArray[np.float32], at_px: Array) -> Array:
+    """Relative slope (N,) of the light on the plate at pixels (N, 2), per pixel; holes apart."""
+    size = (white.shape[1] // CELL_PX, white.shape[0] // CELL_PX)
+    cells = cv2.resize(white, size, interpolation=cv2.INTER_AREA)
+    near = cv2.dilate(cells, np.ones((9, 9), np.uint8))
+    plate = (cells > np.maximum(0.9 * near, 0.1 * near.max())).astype(np.float32)
+    weight = cv2.GaussianBlur(plate, (0, 0), SMOOTH_CELLS)
+    light = cv2.GaussianBlur(plate * cells, (0, 0), SMOOTH_CELLS) / np.maximum(weight, 1e-6)
+    down, across = np.gradient(np.log(np.maximum(light, 1e-3)))
+    u, v = (np.asarray(at_px).T // CELL_PX).astype(int).clip(0, np.array(size)[:, np.newaxis] - 1)
+    return np.asarray(np.hypot(down, across)[v, u] / CELL_PX, dtype=np.float64)
 
 
 def white_image(stack: NDArray[Any], sequence: PatternSequence) -> NDArray[np.float32]:
