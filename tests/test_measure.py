@@ -151,6 +151,20 @@ def test_a_plane_has_no_angle_to_itself_and_a_groove_needs_flanks() -> None:
     assert measure_groove(flat) is None
 
 
+def test_the_groove_keeps_away_from_its_bends() -> None:
+    """The light's blur rounds bends: 5 um over 4 columns here, and none of it in the angle."""
+    columns, rows = 400, 20
+    bent = cloud(lambda x, y: np.minimum(SLOPE * np.abs(x), SLOPE * 1.2e-3), (rows, columns))
+    away = np.minimum(np.abs(bent["x"]), np.abs(np.abs(bent["x"]) - 1.2e-3)) / (4e-3 / columns)
+    bent["z"] += 5e-6 * (away < 4.0)
+    m = measure_groove(bent)
+    assert m is not None
+    assert m.set_aside == 0  # the rounded points are not there to be set aside
+    # Flanks of 120 columns lose at least 8 at either end: half of the reach of a slope.
+    assert 0.5 * 240 * rows < m.points < (240 - 4 * 8) * rows
+    assert abs(m.value - ANGLE_DEG) < 4.0 * m.uncertainty
+
+
 def test_a_deep_hole_is_found_by_where_points_end() -> None:
     """Points end in the edge's blur, none is darker: the diameter says how little it knows."""
     points, centre = disc(0)
