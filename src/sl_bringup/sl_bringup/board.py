@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
     if not (args.square_mm > 0 and min(args.pitch_um) > 0):
         raise ConfigError(f"--square-mm {args.square_mm}, --pitch-um {args.pitch_um}; expected > 0")
-    board = Board(*args.corners, args.square_mm * 1e-3)
+    board = Board(args.corners[0], args.corners[1], args.square_mm * 1e-3)
     views, names, sizes = [], [], ((0, 0), (0, 0))
     for stack in _stacks(args.bag, args.namespace):
         try:

@@ -230,5 +230,6 @@ def png(figure: Figure) -> bytes:
     """PNG of a figure, drawn without a display."""
     buffer = io.BytesIO()
     # Not `savefig`: that draws twice, once for the layout.
-    FigureCanvasAgg(figure).print_png(buffer, pil_kwargs={"compress_level": 4})
+    canvas = FigureCanvasAgg(figure)
+    canvas.print_png(buffer, pil_kwargs={"compress_level": 4})  # type: ignore[no-untyped-call]
     return buffer.getvalue()

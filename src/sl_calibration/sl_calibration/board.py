@@ -60,7 +60,7 @@ class Board:
     def points_m(self) -> Array:
         """Corners (N, 2) on the board, row by row."""
         x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
-        return np.stack([x.ravel(), y.ravel()], axis=1) * self.square_m
+        return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64) * self.square_m
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,8 @@ def _decoded(stack: Stack, sequence: PatternSequence, axis: Axis) -> Array:
 def _swing(stack: Stack, sequence: PatternSequence) -> NDArray[np.float32]:
     """Light that the coarsest pattern of the columns adds or takes, (H, W)."""
     upright, inverse = _pairs(sequence, "column")[0]
-    return np.abs(stack[upright].astype(np.float32) - stack[inverse])
+    swing: NDArray[np.float32] = np.abs(stack[upright].astype(np.float32) - stack[inverse])
+    return swing
 
 
 def _thrown(dmd: Array, corner: Array, reach: int) -> Array:

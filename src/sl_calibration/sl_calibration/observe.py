@@ -29,8 +29,8 @@ MIN_TARGETS = 30
 #: of the field: that does not average out, so each of the hundreds of targets has to count for less
 #: to make up for it. 1.5 px^2 as measured on noise-free images, times the root of 50 a region.
 LIGHT_SLOPE_PX2 = 10.0
-#: What is left in even light, DMD pixels.
-MODEL_SIGMA_PX = 0.0003
+#: What the slant of the views does to edges in even light, DMD pixels: 6e-5, alike everywhere.
+MODEL_SIGMA_PX = 0.0009
 #: The light is looked at in cells of so many pixels, smoothed over so many cells.
 CELL_PX = 8
 SMOOTH_CELLS = 6.0

@@ -30,7 +30,7 @@ def png(figure: Figure) -> bytes:
     """Picture of a figure."""
     buffer = io.BytesIO()
     # Not `savefig`: that draws twice, once for the layout.
-    FigureCanvasAgg(figure).print_png(buffer)
+    FigureCanvasAgg(figure).print_png(buffer)  # type: ignore[no-untyped-call]
     return buffer.getvalue()
 
 
