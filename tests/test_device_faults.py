@@ -6,9 +6,11 @@ The table of `docs/faults.md`; the drivers' own tests go deeper (`test_dlpc900_d
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 
@@ -258,4 +260,24 @@ def test_an_alarm_while_the_stage_moves_spoils_the_scan(cell: Cell) -> None:
     cell.clock.run_at(25.0)
     home(cell)
     assert cell.move(0.0).success
+    cell.recover()
+
+
+def test_a_move_that_begins_with_the_scan_is_never_taken_for_a_stage_at_rest(cell: Cell) -> None:
+    """The stage is quick: all but the first, coarse patterns see it where it went."""
+    began = threading.Event()
+    cell.dmd.on_exposure = lambda *edge: (cell.camera.on_exposure(*edge), began.set())
+    for x_m in (0.0005, 0.0, 0.0005, 0.0):
+        began.clear()
+        moved: list[Any] = []
+        mover = threading.Thread(
+            target=lambda x=x_m, to=moved: (began.wait(60.0), to.append(cell.begin_move(x)))
+        )
+        mover.start()
+        _, verdict = cell.project()
+        mover.join()
+        assert verdict is None or verdict.status == MatchedFrame.STACK_REFUSED
+        assert cell.check_stacks() == 0
+        wait(moved[0].done, "the move")
+    cell.dmd.on_exposure = cell.camera.on_exposure
     cell.recover()

@@ -163,6 +163,12 @@ class GrblStage:
             raise DeviceTimeout("GRBL reports work positions and has not sent its offset (WCO) yet")
         return frame.stage_m(talk.machine_mm)
 
+    @property
+    def measured_ns(self) -> int:
+        """When the position that ``position_m`` told last was asked for, host clock."""
+        talk = self._talk
+        return talk.measured_ns if talk is not None else 0
+
     def limits_m(self) -> StageLimits:
         """Reach as the controller's settings have it (``$130`` to ``$132``)."""
         return self._open_frame().limits()

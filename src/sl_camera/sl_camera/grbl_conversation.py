@@ -89,6 +89,8 @@ class GrblConversation:
         ``$n`` with a number, as last printed.
     machine_mm : tuple of float or None
         Last MPos.
+    measured_ns : int
+        When it was asked for, host clock: it is not older.
     alarm : str or None
         Why nothing may move until it is acknowledged; also a restart that nobody asked for.
     is_deaf : bool
@@ -119,6 +121,8 @@ class GrblConversation:
         self._replies: list[str] = []
         self._report: Report | None = None
         self._report_time = -math.inf
+        self._asked_ns = 0  # of the oldest question for the status that has no answer yet
+        self.measured_ns = 0
         self._offset_mm: Triple | None = None
         self._reports = self._banners = 0
         self._banner_wanted = True
@@ -168,6 +172,7 @@ class GrblConversation:
             return
         self._offset_mm = report.offset or self._offset_mm
         self._report, self._report_time = report, time.monotonic()
+        self.measured_ns, self._asked_ns = self._asked_ns or time.time_ns(), 0
         self._reports += 1
         offset = (0.0, 0.0, 0.0) if report.is_machine else self._offset_mm
         if offset is not None:
@@ -196,6 +201,8 @@ class GrblConversation:
         """Send bytes, real-time commands among them; DeviceLost where there is no port."""
         if self.lost is not None:
             raise DeviceLost(f"stage on {self.port}: {self.lost}")
+        if data == STATUS and not self._asked_ns:
+            self._asked_ns = time.time_ns()
         self._link.write(data)
 
     def _wait(self, done: Callable[[], bool], timeout_s: float) -> bool:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
@@ -26,9 +27,6 @@ from sl_projector.errors import (
     DeviceTimeout,
     SlError,
 )
-
-#: While it moves, a position is at most so old (`StageDriver.position_m`).
-MOVING_AGE_NS = 200_000_000
 
 KINDS = ("grbl", "zaber", "manual")
 
@@ -53,6 +51,7 @@ class StageNode(RigNode):
         self._declare_parameters()
         self._make_driver = make_driver or self._make_configured
         self._moves = 0
+        self._began_ns = 0  # the last motion; what is read later is not older
         self._state = StageState("lost", "not connected yet")
         self._stop = threading.Event()
         self._poses = self.create_publisher(PoseStamped, "stage/pose", EVENTS)
@@ -166,8 +165,27 @@ class StageNode(RigNode):
         if self._state.kind in ("alarm", "homing"):
             return
         position_m = driver.position_m()
-        moving = moves or self._moves or self._state.kind != "idle"
-        self._poses.publish(self._pose(position_m, before_ns - (MOVING_AGE_NS if moving else 0)))
+        stamp_ns = before_ns
+        if moves or self._moves or self._state.kind != "idle":
+            # A driver that tells an older reading says of when; others ask each time.
+            stamp_ns = min(before_ns, int(getattr(driver, "measured_ns", before_ns)))
+        self._poses.publish(self._pose(position_m, max(stamp_ns, self._began_ns)))
+
+    @contextmanager
+    def _moving(self, driver: StageDriver) -> Iterator[None]:
+        """Tell where the stage stands as it begins to move: from here on it is elsewhere.
+
+        Else a reading that is late might make believe that it stood there before.
+        """
+        if driver.state().kind == "idle":
+            position_m = driver.position_m()
+            self._began_ns = time.time_ns()
+            self._poses.publish(self._pose(position_m, self._began_ns))
+        self._moves += 1
+        try:
+            yield
+        finally:
+            self._moves -= 1
 
     def _pose(self, position_m: Position, stamp_ns: int) -> PoseStamped:
         return stage_pose(position_m, stamp_ns, WORLD_FRAME)
@@ -218,21 +236,15 @@ class StageNode(RigNode):
             response.pose = self._pose(driver.position_m(), time.time_ns())
             response.success, response.message = True, "within the travel"
             return
-        self._moves += 1
-        try:
+        with self._moving(driver):
             driver.move_to(*target_m)
-        finally:
-            self._moves -= 1
         response.pose = self._pose(driver.position_m(), time.time_ns())
         response.success = True
         response.message = "moved to " + ", ".join(f"{1e3 * a:.4f}" for a in target_m) + " mm"
 
     def _home(self, driver: StageDriver, _request: Any, response: Any) -> None:
-        self._moves += 1
-        try:
+        with self._moving(driver):
             driver.home()
-        finally:
-            self._moves -= 1
         response.success, response.message = True, "homed"
 
     def _halt(self, driver: StageDriver, _request: Any, response: Any) -> None:
