@@ -55,7 +55,8 @@ def write_page(path: Path, report: Mapping[str, Any], pictures: Mapping[str, byt
     pictures : mapping
         PNG by caption.
     """
-    title = f"Scan {report['scan_id']} of {report['bag']}"
+    live = report["bag"] == "live"
+    title = f"Scan {report['scan_id']}" + (", live" if live else f" of {report['bag']}")
     parts = [f"<h1>{_text(title)}</h1>", verdict_line(report["good"], report["reasons"])]
     parts += [_table(heading, rows) for heading, rows in _sections(report)]
     parts += [
@@ -84,27 +85,50 @@ def verdict_line(good: bool, reasons: Sequence[str]) -> str:
 
 def _sections(report: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Tables of the page: heading and rows of name and value."""
-    origin = [
-        ("Sequence", str(report["sequence"])),
-        ("Images", str(report.get("images", "-"))),
-        ("Saturated from", f"{report['saturation_dn']} DN" if "saturation_dn" in report else "-"),
-        ("Calibration", str(report.get("calibration_source", "-"))),
-        ("Live cloud", str(report.get("live", {}).get("told", "-"))),
-        *((key.replace("_", " ").capitalize(), value) for key, value in _hashes(report)),
-    ]
-    sections = [("Origin", origin)]
+    sections = [("Origin", _origin_rows(report))]
     if "points" in report:
         sections.insert(0, ("Result", _result_rows(report)))
         refused = [(k, f"{v:,}") for k, v in report["refused"].items() if v]
         if refused:
             sections.insert(1, ("Positions refused", refused))
+    if report.get("groove", {}).get("found"):
+        sections.insert(1, ("Groove (the paper's Table 2)", _groove_rows(report["groove"])))
     notes = [("Note", note) for note in report.get("notes", ())]
     return [*sections, ("Notes", notes)] if notes else sections
 
 
-def _hashes(report: Mapping[str, Any]) -> list[tuple[str, str]]:
-    keys = ("calibration_hash", "settings_hash", "cloud_hash", "software")
-    return [(key, str(report[key])) for key in keys if report.get(key)]
+def _origin_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Where the scan comes from, as far as is known: a live scan knows other things."""
+    known = {
+        "Sequence": report["sequence"],
+        "Images": report.get("images"),
+        "Saturated from": _with_unit(report.get("saturation_dn"), "DN"),
+        "Acquisition": _with_unit(report.get("acquisition_s"), "s", ".2f"),
+        "From the last image to the cloud": _with_unit(report.get("processing_s"), "s", ".2f"),
+        "Attempts": report.get("attempts"),
+        "Calibration": report.get("calibration_source"),
+        "Live cloud": report.get("live", {}).get("told"),
+        "Calibration hash": report.get("calibration_hash"),
+        "Settings hash": report.get("settings_hash"),
+        "Cloud hash": report.get("cloud_hash"),
+        "Software": report.get("software"),
+    }
+    return [(name, str(value)) for name, value in known.items() if value not in (None, "")]
+
+
+def _with_unit(value: float | None, unit: str, form: str = "") -> str | None:
+    return None if value is None else f"{value:{form}} {unit}"
+
+
+def _groove_rows(groove: Mapping[str, Any]) -> list[tuple[str, str]]:
+    angle, u = groove["included_angle_deg"], groove["u_included_angle_deg"]
+    rows = [("Included angle", f"{angle:.4f}° ± {u:.4f}° (1 standard uncertainty)")]
+    for side in ("left", "right"):
+        plane = groove[side]
+        normal = ", ".join(f"{n:+.5f}" for n in plane["normal"])
+        told = f"rms {micrometres(plane['rms_m'])} of {plane['points']:,} points, normal ({normal})"
+        rows.append((f"{side.capitalize()} flank", told))
+    return rows
 
 
 def _result_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:

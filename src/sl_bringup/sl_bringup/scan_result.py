@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sl_bringup.paper_tables import table_2_lines
 from sl_bringup.report import micrometres, write_json, write_page
 from sl_bringup.scan_files import write_scan
+from sl_bringup.version import software_version
 from sl_reconstruct.cloud import CLOUD_DTYPE, Cloud
 from sl_reconstruct.cloud_files import cloud_hash
 from sl_reconstruct.measure.groove import measure_groove
@@ -48,6 +49,7 @@ def live_report(answer: Mapping[str, Any], success: bool, message: str) -> dict[
         **{key: value for key, value in answer.items() if key not in keys},
         "present_fraction": answer["points"] / lit if lit else 0.0,
         "figures": figures,
+        "software": software_version(),
     }
 
 
