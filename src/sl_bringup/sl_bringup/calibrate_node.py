@@ -4,29 +4,25 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from rclpy.action import ActionClient
-from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
 from sl_interfaces.action import Calibrate
 from sl_interfaces.srv import Verify
 
 from sl_bringup.calibrate import outcome_lines
+from sl_bringup.client_node import GraphClient, run_client
 from sl_bringup.paper_tables import table_1_lines
-from sl_bringup.progress import complain, say
-from sl_projector.errors import DeviceLost, DeviceTimeout, SlError
+from sl_bringup.progress import say
+from sl_projector.errors import DeviceLost
 
 #: A cancelled run answers when stage and projector have stopped.
 _CANCEL_S = 20.0
 
 
-class CalibrateClient(Node):  # type: ignore[misc]  # rclpy carries no types
+class CalibrateClient(GraphClient):
     """Asks for one calibration, or for a check of the one in force.
 
     Parameters
@@ -36,71 +32,43 @@ class CalibrateClient(Node):  # type: ignore[misc]  # rclpy carries no types
     """
 
     def __init__(self, namespace: str) -> None:
-        super().__init__("calibrate_client", namespace=namespace)
-        self._shown = ""
+        super().__init__("calibrate_client", namespace)
         self._action = ActionClient(self, Calibrate, "calibration/calibrate")
         self._verify = self.create_client(Verify, "calibration/verify")
 
-    def connect(self, patience_s: float) -> None:
-        """Wait for the graph.
-
-        Raises
-        ------
-        DeviceLost
-            When no node offers the action.
-        """
-        if not self._until(self._action.server_is_ready, patience_s):
-            raise DeviceLost(
-                f"no node offers the action {self.get_namespace()}/calibration/calibrate in domain "
-                f"{self.context.get_domain_id()}; start the graph with 'slrig up', or use --up"
-            )
-
-    def calibrate(self, goal: Calibrate.Goal, patience_s: float) -> Any:
+    def calibrate(self, goal: Calibrate.Goal, connect_s: float, patience_s: float) -> Any:
         """Calibrate, and return the action's result; an interrupt cancels the run.
 
         Raises
         ------
+        DeviceLost
+            When no node offers it within ``connect_s``, or it is refused.
         DeviceTimeout
             When the graph does not answer in time.
         """
-        handle = self._answer(
-            self._action.send_goal_async(goal, feedback_callback=self._show), patience_s
-        )
+        self.await_graph(self._action.server_is_ready, "calibration/calibrate", connect_s)
+        asked = self._action.send_goal_async(goal, feedback_callback=self._feedback)
+        handle = self.answer(asked, patience_s)
         if not handle.accepted:
             raise DeviceLost("the graph refused the calibration")
         result = handle.get_result_async()
         try:
-            return self._answer(result, patience_s).result
+            return self.answer(result, patience_s).result
         except KeyboardInterrupt:
             handle.cancel_goal_async()
-            self._until(result.done, _CANCEL_S)
+            self.until(result.done, _CANCEL_S)
             raise
 
-    def verify(self, request: Verify.Request, patience_s: float) -> Any:
-        """Check the calibration in force, and return the service's answer."""
-        return self._answer(self._verify.call_async(request), patience_s)
+    def verify(self, request: Verify.Request, connect_s: float, patience_s: float) -> Any:
+        """Check the calibration in force, and return the service's answer; errors as above."""
+        # A request to a service that is not found yet would be lost.
+        self.await_graph(self._verify.service_is_ready, "calibration/verify", connect_s)
+        return self.answer(self._verify.call_async(request), patience_s)
 
-    def _answer(self, future: Any, patience_s: float) -> Any:
-        if not self._until(future.done, patience_s):
-            raise DeviceTimeout(f"the graph did not answer within {patience_s:g} s")
-        return future.result()
-
-    def _until(self, condition: Callable[[], bool], patience_s: float) -> bool:
-        end_s = time.monotonic() + patience_s
-        while not condition():
-            if time.monotonic() > end_s:
-                return False
-            rclpy.spin_once(self, timeout_sec=0.05)
-        return True
-
-    def _show(self, message: Any) -> None:
+    def _feedback(self, message: Any) -> None:
         told = message.feedback
         line = f"calibrate: view {told.view} of {told.views}, {told.stage}"
-        if sys.stderr.isatty():
-            sys.stderr.write(f"\r{line} {told.progress:4.0%}      ")
-        elif line != self._shown:
-            complain(line)
-        self._shown = line
+        self.show(line, f" {told.progress:4.0%}")
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -120,9 +88,8 @@ def _calibrate(client: CalibrateClient, args: argparse.Namespace) -> int:
     goal = Calibrate.Goal(
         target=args.target, heights_m=args.heights_m, sequence=args.sequence, keep=args.keep
     )
-    result = client.calibrate(goal, args.timeout)
-    if sys.stderr.isatty():
-        sys.stderr.write("\n")
+    result = client.calibrate(goal, args.connect_timeout, args.timeout)
+    client.end_line()
     for line in outcome_lines(result):
         say(line)
     for line in _table_1(result.report):
@@ -140,7 +107,7 @@ def _table_1(report: str) -> list[str]:
 
 def _verify(client: CalibrateClient, args: argparse.Namespace) -> int:
     request = Verify.Request(target=args.verify, heights_m=args.heights_m)
-    answer = client.verify(request, args.timeout)
+    answer = client.verify(request, args.connect_timeout, args.timeout)
     say(answer.message)
     if answer.report:
         say(f"report            {answer.report}")
@@ -150,19 +117,12 @@ def _verify(client: CalibrateClient, args: argparse.Namespace) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Calibrate once; exit status 0 only when the calibration is in force."""
     args = _arguments(argv)
-    rclpy.init(args=[])
-    try:
+
+    def work() -> int:
         client = CalibrateClient(args.namespace)
-        client.connect(args.connect_timeout)
         return (_verify if args.verify else _calibrate)(client, args)
-    except SlError as error:
-        complain(f"slrig calibrate: error: {error}")
-        return 1
-    except (KeyboardInterrupt, ExternalShutdownException):
-        complain("slrig calibrate: interrupted")
-        return 130
-    finally:
-        rclpy.try_shutdown()
+
+    return run_client("slrig calibrate", work)
 
 
 if __name__ == "__main__":

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import sys
 import threading
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from rclpy.action import ActionClient
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 from sl_interfaces.action import Scan
 from sl_interfaces.msg import ScanReport
 
+from sl_bringup.client_node import GraphClient, run_client
 from sl_bringup.progress import complain, say
 from sl_bringup.scan_result import MEASURES, check_cloud, live_report, summary, write_result
 from sl_projector.base_node import LARGE
-from sl_projector.errors import DeviceLost, DeviceTimeout, SlError
+from sl_projector.errors import DeviceLost
 from sl_reconstruct.messages import cloud_from_msg
 
 #: The cloud is sent before the action's result; it may still be later by so long.
@@ -30,7 +27,7 @@ CLOUD_WAIT_S = 10.0
 DEFAULT_REPEATS = 255
 
 
-class ScanClient(Node):  # type: ignore[misc]  # rclpy carries no types
+class ScanClient(GraphClient):
     """Asks for one scan.
 
     Parameters
@@ -40,9 +37,8 @@ class ScanClient(Node):  # type: ignore[misc]  # rclpy carries no types
     """
 
     def __init__(self, namespace: str) -> None:
-        super().__init__("scan_client", namespace=namespace)
+        super().__init__("scan_client", namespace)
         self._cloud: PointCloud2 | None = None
-        self._shown = ""
         self._action = ActionClient(self, Scan, "scan")
         self.create_subscription(PointCloud2, "reconstruct/points", self._take, LARGE)
 
@@ -54,17 +50,13 @@ class ScanClient(Node):  # type: ignore[misc]  # rclpy carries no types
         DeviceLost
             When no node offers the action.
         """
-        connected = self._until(
+        self.await_graph(
             lambda: (
                 self._action.server_is_ready() and self.count_publishers("reconstruct/points") > 0
             ),
+            "scan",
             patience_s,
         )
-        if not connected:
-            raise DeviceLost(
-                f"no node offers the action {self.get_namespace()}/scan in domain "
-                f"{self.context.get_domain_id()}; start the graph with 'slrig up', or use --up"
-            )
 
     def scan(self, goal: Scan.Goal, patience_s: float) -> tuple[Any, PointCloud2 | None]:
         """Scan, and return the action's result and the cloud.
@@ -74,43 +66,26 @@ class ScanClient(Node):  # type: ignore[misc]  # rclpy carries no types
         DeviceTimeout
             When the graph does not answer in time.
         """
-        asked = self._action.send_goal_async(goal, feedback_callback=self._show)
-        handle = self._answer(asked, patience_s)
+        asked = self._action.send_goal_async(goal, feedback_callback=self._feedback)
+        handle = self.answer(asked, patience_s)
         if not handle.accepted:
             raise DeviceLost("the graph refused the scan")
         try:
-            result = self._answer(handle.get_result_async(), patience_s).result
+            result = self.answer(handle.get_result_async(), patience_s).result
         except (KeyboardInterrupt, ExternalShutdownException):
             handle.cancel_goal_async()
             raise
         if result.success:
-            self._until(lambda: self._cloud is not None, CLOUD_WAIT_S)
+            self.until(lambda: self._cloud is not None, CLOUD_WAIT_S)
         return result, self._cloud
-
-    def _answer(self, future: Any, patience_s: float) -> Any:
-        if not self._until(future.done, patience_s):
-            raise DeviceTimeout(f"the graph did not answer within {patience_s:g} s")
-        return future.result()
-
-    def _until(self, condition: Callable[[], bool], patience_s: float) -> bool:
-        end_s = time.monotonic() + patience_s
-        while not condition():
-            if time.monotonic() > end_s:
-                return False
-            rclpy.spin_once(self, timeout_sec=0.05)
-        return True
 
     def _take(self, message: PointCloud2) -> None:
         self._cloud = message
 
-    def _show(self, message: Any) -> None:
+    def _feedback(self, message: Any) -> None:
         told = message.feedback
         line = f"scan: {told.stage}, attempt {told.attempt}"
-        if sys.stderr.isatty():
-            sys.stderr.write(f"\r{line}, {told.frames}/{told.count} frames {told.progress:4.0%} ")
-        elif line != self._shown:
-            complain(line)
-        self._shown = line
+        self.show(line, f", {told.frames}/{told.count} frames {told.progress:4.0%}")
 
 
 def fields_of(report: ScanReport) -> dict[str, Any]:
@@ -159,25 +134,18 @@ def _import_meanwhile(module: str) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Scan once; exit status 0 only when the cloud is there."""
     args = _arguments(argv)
-    rclpy.init(args=[])
-    try:
+
+    def work() -> int:
         client = ScanClient(args.namespace)
         client.connect(args.connect_timeout)
         if not args.no_pictures:
             _import_meanwhile("sl_bringup.pictures")
         goal = Scan.Goal(sequence=args.sequence, exposure_s=args.exposure, max_repeats=args.repeats)
         result, cloud = client.scan(goal, args.timeout)
-        if sys.stderr.isatty():
-            sys.stderr.write("\n")
+        client.end_line()
         return _deliver(args, result, cloud)
-    except SlError as error:
-        complain(f"slrig scan: error: {error}")
-        return 1
-    except (KeyboardInterrupt, ExternalShutdownException):
-        complain("slrig scan: interrupted")
-        return 130
-    finally:
-        rclpy.try_shutdown()
+
+    return run_client("slrig scan", work)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,119 @@
+"""What all clients of the graph's actions share: waiting for it, its answers, how far it is."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+
+from sl_bringup.progress import complain
+from sl_projector.errors import DeviceLost, DeviceTimeout, SlError
+
+INTERRUPTED = 130
+
+
+class GraphClient(Node):  # type: ignore[misc]  # rclpy carries no types
+    """A node that asks for something, shows progress in one line, and ends.
+
+    Parameters
+    ----------
+    name : str
+        Of the node.
+    namespace : str
+        Of the rig.
+    """
+
+    def __init__(self, name: str, namespace: str) -> None:
+        super().__init__(name, namespace=namespace)
+        self._shown = ""
+
+    def await_graph(self, is_there: Callable[[], bool], wanted: str, patience_s: float) -> None:
+        """Wait until what is wanted of the graph is offered.
+
+        Parameters
+        ----------
+        is_there : callable
+            Whether it is.
+        wanted : str
+            What it is, below the namespace.
+        patience_s : float
+            Longest wait, seconds.
+
+        Raises
+        ------
+        DeviceLost
+            When nobody offers it.
+        """
+        if not self.until(is_there, patience_s):
+            raise DeviceLost(
+                f"no node offers {self.get_namespace()}/{wanted} in domain "
+                f"{self.context.get_domain_id()}; start the graph with 'slrig up', or use --up"
+            )
+
+    def answer(self, future: Any, patience_s: float) -> Any:
+        """Return what a future holds.
+
+        Raises
+        ------
+        DeviceTimeout
+            When the graph does not answer in time.
+        """
+        if not self.until(future.done, patience_s):
+            raise DeviceTimeout(f"the graph did not answer within {patience_s:g} s")
+        return future.result()
+
+    def until(self, condition: Callable[[], bool], patience_s: float) -> bool:
+        """Serve the node until a condition holds; whether it does in time."""
+        end_s = time.monotonic() + patience_s
+        while not condition():
+            if time.monotonic() > end_s:
+                return False
+            rclpy.spin_once(self, timeout_sec=0.05)
+        return True
+
+    def show(self, line: str, detail: str) -> None:
+        """Tell progress: on a terminal over the line before, in a log only what is new."""
+        if sys.stderr.isatty():
+            sys.stderr.write(f"\r{line}{detail}      ")
+        elif line != self._shown:
+            complain(line)
+        self._shown = line
+
+    def end_line(self) -> None:
+        """Leave the line of the progress."""
+        if self._shown and sys.stderr.isatty():
+            sys.stderr.write("\n")
+        self._shown = ""
+
+
+def run_client(command: str, work: Callable[[], int]) -> int:
+    """Do a client's work with ROS up, and tell what goes wrong.
+
+    Parameters
+    ----------
+    command : str
+        Under which the user knows it.
+    work : callable
+        Returns the exit status.
+
+    Returns
+    -------
+    int
+        Its exit status; 1 after an error, 130 after Ctrl-C.
+    """
+    rclpy.init(args=[])
+    try:
+        return work()
+    except SlError as error:
+        complain(f"{command}: error: {error}")
+        return 1
+    except (KeyboardInterrupt, ExternalShutdownException):
+        complain(f"{command}: interrupted")
+        return INTERRUPTED
+    finally:
+        rclpy.try_shutdown()
