@@ -256,13 +256,16 @@ class Bag:
         wanted: Mapping[str, Topic],
         quick: bool,
     ) -> Iterator[Raw]:
+        known = [connection for connection in connections if connection.msgtype != NO_TYPE]
         for connection in connections:
-            if connection.msgtype == NO_TYPE:
+            if connection not in known:
                 self.lose(f"{file.name}: what type {connection.topic} has cannot be read")
-                return
+                continue
             digest = connection.digest or file.digests.get(connection.topic, "")
             _check_type(connection, digest, wanted[connection.topic], self.path)
-        for connection, received_ns, data in self._packets(file, connections, quick):
+        if not known:  # the readers take none for all
+            return
+        for connection, received_ns, data in self._packets(file, known, quick):
             yield Raw(wanted[connection.topic], received_ns, data)
 
     def _packets(

@@ -191,7 +191,8 @@ def solve_again(source: Path, output: Path | None) -> int:
     stored = source.suffix == ".npz" or (source / OBSERVATIONS).is_file()
     notes: list[str] = []
     if stored:
-        outcome = solve_stored(source, output or source.with_suffix("") / "again")
+        run = source if source.is_dir() else source.with_suffix("")
+        outcome = solve_stored(source, output or run / "again")
     else:
         folder = output or Path(f"{source.stem}_calibration")
         outcome, notes = solve_recorded(source, folder, tell=complain)

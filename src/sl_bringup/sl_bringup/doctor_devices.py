@@ -63,11 +63,17 @@ def _may_use(node: Path) -> bool:
 
 def _join_group(node: Path) -> str:
     """Return the command that gives the user a device's group."""
-    group = grp.getgrgid(node.stat().st_gid).gr_name
-    user = os.environ.get("USER", "$USER")
-    if user in grp.getgrnam(group).gr_mem:
-        return f"you were put into the group {group}, but not yet when you logged in: log in again"
-    return f"sudo usermod -aG {group} {user}, then log out and in again"
+    number, user = node.stat().st_gid, os.environ.get("USER", "$USER")
+    try:
+        group = grp.getgrgid(number)
+    except KeyError:  # in a container, the host's groups have no names
+        return f"in a container: start it with --group-add {number}"
+    if user in group.gr_mem:
+        return (
+            f"you were put into the group {group.gr_name}, but not yet when you logged in: "
+            "log in again"
+        )
+    return f"sudo usermod -aG {group.gr_name} {user}, then log out and in again"
 
 
 def _holders(node: Path) -> str:
@@ -314,6 +320,6 @@ def _video(device: str, running: bool) -> Finding:
     if not _may_use(path):
         text = f"you have no permission for {path}"
         return Finding("bad", "camera", text, _join_group(path))
-    if not running and _holders(path):
-        return _busy("camera", f"{path} is busy", path)
+    if not running and _holders(path.resolve()):
+        return _busy("camera", f"{path} is busy", path.resolve())
     return Finding("ok", "camera", str(path))

@@ -333,6 +333,6 @@ def check_motion(before: View, after: View) -> None:
     if float(np.median(moved_px)) < MIN_MOTION_PX:
         raise CalibrationError(
             f"the stage says that it moved by {moved_m * 1e3:.4f} mm but "
-            f" the holes' images moved by {float(np.median(moved_px)):.3f} px; expected at "
+            f"the holes' images moved by {float(np.median(moved_px)):.3f} px; expected at "
             f"least {MIN_MOTION_PX} px: the stage, or the plate on it, does not move"
         )
