@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sl_bringup.bags import open_bag
-from sl_bringup.progress import say
+from sl_bringup.progress import complain, say
 from sl_bringup.recorded_settings import read_settings
 from sl_bringup.stacks import decisions
 from sl_camera.matching import MatchedStack, StackMatcher, Status
@@ -98,6 +98,10 @@ def _stacks(path: Path, namespace: str | None) -> Iterator[MatchedStack]:
     with open_bag(path, namespace) as bag:
         matcher = StackMatcher(read_settings(bag).matching)
         for decision in decisions(bag, matcher):
+            if decision.status == Status.STACK_REFUSED:
+                complain(f"slrig board: scan {decision.scan_id} is left out: {decision.reason}")
             if decision.status == Status.STACK_COMPLETE and decision.stack is not None:
                 yield decision.stack
                 matcher.recycle(decision.stack)
+        for line in bag.lost:
+            complain(f"slrig board: lost: {line}")
