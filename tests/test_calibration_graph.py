@@ -81,7 +81,7 @@ def start(directory: Path, domain: int) -> dict[str, subprocess.Popen[bytes]]:
 
     options = ("--config", str(directory / "bench.yaml"), "--runtime-dir", str(directory))
     processes = {"bench": run("bench", "sl_bench.bench", *options)}
-    wait((directory / "control.sock").exists, "the bench", 60.0)
+    wait((directory / "control.sock").exists, "the bench", 280.0)
     for name, (module, parameter) in NODES.items():
         processes[name] = run(name, module, "--ros-args", "-p", parameter.format(directory))
     return processes
@@ -96,7 +96,7 @@ def await_devices(graph: Graph) -> None:
         levels = {s.name.partition(":")[0]: s.level for array in said for s in array.status}
         return all(levels.get(name) == DiagnosticStatus.OK for name in NODES)
 
-    wait(ready, "the devices", 60.0)
+    wait(ready, "the devices", 280.0)
 
 
 @pytest.fixture(scope="module")
@@ -205,12 +205,12 @@ def test_a_run_can_be_cancelled_half_way(running: Running, calibrated: Calibrate
     goal = CalibrateAction.Goal(heights_m=HEIGHTS_M)
     sent = client.send_goal_async(goal, lambda m: told.append(m.feedback))
     wait(sent.done, "the goal to be accepted")
-    wait(lambda: told and told[-1].stage == "planes", "the first view", 30.0)
+    wait(lambda: told and told[-1].stage == "planes", "the first view", 120.0)
     second = running.calibrate(heights_m=HEIGHTS_M)
     assert "going on already" in second.message
     result = sent.result().get_result_async()
     sent.result().cancel_goal_async()
-    wait(result.done, "the cancelled run's end", 30.0)
+    wait(result.done, "the cancelled run's end", 120.0)
     assert result.result().status == 5  # action_msgs/GoalStatus.STATUS_CANCELED
     assert "cancelled" in result.result().result.message
     client.destroy()

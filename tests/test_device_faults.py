@@ -211,7 +211,8 @@ def stage_fault(
         cell.diagnostics.clear()
         ask(cell)
         cell.move(0.004)
-        if not (said_otherwise := cell.told(words, 3.0)):
+        # What stays until it is mended is told for sure; else it may have hit another answer.
+        if not (said_otherwise := cell.told(words, 60.0 if mend else 3.0)):
             break
         # The noise was before an answer to nobody but the pose.
         assert cell.move(0.0).success, said_otherwise
