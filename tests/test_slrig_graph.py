@@ -112,6 +112,15 @@ def test_a_sequence_that_does_not_exist_is_refused(graph: Command, tmp_path: Pat
     assert not (tmp_path / "cloud.ply").exists()
 
 
+def test_an_interrupted_calibration_does_not_go_on_in_the_graph(
+    graph: Command, ros_domain: int
+) -> None:
+    command = Command("calibrate", "--domain", f"{ros_domain}")
+    command.wait_for("planes", 120.0)
+    assert command.end(signal.SIGINT, patience_s=120.0) == 130, command.text
+    graph.wait_for("calibration cancelled; stage and projector were stopped", 120.0)
+
+
 def test_scans_with_devices_that_fail_at_random(graph: Command, ros_domain: int) -> None:
     """A taste of ``benchmarks/soak_faults.py``: no wrong cloud, no dead node, all well again.
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 import asyncio
 import math
-import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sl_bringup.graph import Graph, GraphOptions, client_command, client_environment, is_running
+from sl_bringup.graph import Graph, GraphOptions, exec_client, is_running
 from sl_bringup.progress import complain, say
 from sl_bringup.up import add_graph_arguments, graph_options, until_signal
 from sl_projector.documents import read_document
@@ -168,11 +167,7 @@ def run(args: argparse.Namespace) -> int:
         with log.open("w") as file:
             tell = _writer(file)
             return asyncio.run(calibrate_once(options, client, args.ready_timeout, tell))
-    command = client_command(CLIENT, options, *client)
-    try:
-        return subprocess.run(command, env=client_environment(options), check=False).returncode
-    except KeyboardInterrupt:
-        return INTERRUPTED
+    return exec_client(CLIENT, options, *client)
 
 
 def _writer(file: Any) -> Callable[[str], None]:

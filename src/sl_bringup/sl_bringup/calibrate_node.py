@@ -18,9 +18,6 @@ from sl_bringup.paper_tables import table_1_lines
 from sl_bringup.progress import say
 from sl_projector.errors import DeviceLost
 
-#: A cancelled run answers when stage and projector have stopped.
-_CANCEL_S = 20.0
-
 
 class CalibrateClient(GraphClient):
     """Asks for one calibration, or for a check of the one in force.
@@ -51,13 +48,7 @@ class CalibrateClient(GraphClient):
         handle = self.answer(asked, patience_s)
         if not handle.accepted:
             raise DeviceLost("the graph refused the calibration")
-        result = handle.get_result_async()
-        try:
-            return self.answer(result, patience_s).result
-        except KeyboardInterrupt:
-            handle.cancel_goal_async()
-            self.until(result.done, _CANCEL_S)
-            raise
+        return self.outcome(handle, patience_s)
 
     def verify(self, request: Verify.Request, connect_s: float, patience_s: float) -> Any:
         """Check the calibration in force, and return the service's answer; errors as above."""

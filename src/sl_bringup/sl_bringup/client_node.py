@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 from collections.abc import Callable
 from typing import Any
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from sl_bringup.progress import complain
 from sl_projector.errors import DeviceLost, DeviceTimeout, SlError
 
 INTERRUPTED = 130
+#: A cancelled goal ends when stage and projector have stopped.
+CANCEL_S = 20.0
 
 
 class GraphClient(Node):  # type: ignore[misc]  # rclpy carries no types
@@ -67,6 +70,22 @@ class GraphClient(Node):  # type: ignore[misc]  # rclpy carries no types
             raise DeviceTimeout(f"the graph did not answer within {patience_s:g} s")
         return future.result()
 
+    def outcome(self, goal: Any, patience_s: float) -> Any:
+        """Return the result of a goal; an interrupt cancels it and waits for its end.
+
+        Raises
+        ------
+        DeviceTimeout
+            When it does not end in time.
+        """
+        result = goal.get_result_async()
+        try:
+            return self.answer(result, patience_s).result
+        except KeyboardInterrupt:
+            goal.cancel_goal_async()
+            self.until(result.done, CANCEL_S)
+            raise
+
     def until(self, condition: Callable[[], bool], patience_s: float) -> bool:
         """Serve the node until a condition holds; whether it does in time."""
         end_s = time.monotonic() + patience_s
@@ -106,13 +125,16 @@ def run_client(command: str, work: Callable[[], int]) -> int:
     int
         Its exit status; 1 after an error, 130 after Ctrl-C.
     """
-    rclpy.init(args=[])
+    # ROS would end itself at a signal, and nothing could be cancelled any more.
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     try:
         return work()
     except SlError as error:
         complain(f"{command}: error: {error}")
         return 1
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except KeyboardInterrupt:
         complain(f"{command}: interrupted")
         return INTERRUPTED
     finally:

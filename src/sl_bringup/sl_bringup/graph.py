@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, NoReturn
 
 from sl_bringup.graph_config import (
     NODES,
@@ -75,6 +75,13 @@ def client_command(module: str, options: GraphOptions, *arguments: str) -> tuple
 def client_environment(options: GraphOptions) -> dict[str, str]:
     """Environment of a ROS client of the graph."""
     return process_environment(options.transport.environment())
+
+
+def exec_client(module: str, options: GraphOptions, *arguments: str) -> NoReturn:
+    """Replace this process by a ROS client of the graph, so that signals reach it directly."""
+    command = client_command(module, options, *arguments)
+    sys.stdout.flush()
+    os.execve(command[0], command, client_environment(options))
 
 
 class Graph:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import subprocess
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from sl_bringup.calibrate import calibrate_bench
-from sl_bringup.graph import Graph, GraphOptions, client_command, client_environment, is_running
+from sl_bringup.graph import Graph, GraphOptions, exec_client, is_running
 from sl_bringup.progress import complain, say
 from sl_bringup.up import add_graph_arguments, graph_options, until_signal
 from sl_projector.errors import ConfigError
@@ -120,9 +119,4 @@ def run(args: argparse.Namespace) -> int:
     if args.up and not is_running(options.directory):
         log = args.output / "graph.log"
         return asyncio.run(scan_once(options, client, args.ready_timeout, log, args.verbose))
-    command = client_command(CLIENT, options, *client)
-    environment = client_environment(options)
-    try:
-        return subprocess.run(command, env=environment, check=False).returncode
-    except KeyboardInterrupt:
-        return INTERRUPTED
+    return exec_client(CLIENT, options, *client)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.action import ActionClient
-from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import PointCloud2
 from sl_interfaces.action import Scan
 from sl_interfaces.msg import ScanReport
@@ -59,7 +58,7 @@ class ScanClient(GraphClient):
         )
 
     def scan(self, goal: Scan.Goal, patience_s: float) -> tuple[Any, PointCloud2 | None]:
-        """Scan, and return the action's result and the cloud.
+        """Scan, and return the action's result and the cloud; an interrupt cancels the scan.
 
         Raises
         ------
@@ -70,11 +69,7 @@ class ScanClient(GraphClient):
         handle = self.answer(asked, patience_s)
         if not handle.accepted:
             raise DeviceLost("the graph refused the scan")
-        try:
-            result = self.answer(handle.get_result_async(), patience_s).result
-        except (KeyboardInterrupt, ExternalShutdownException):
-            handle.cancel_goal_async()
-            raise
+        result = self.outcome(handle, patience_s)
         if result.success:
             self.until(lambda: self._cloud is not None, CLOUD_WAIT_S)
         return result, self._cloud
