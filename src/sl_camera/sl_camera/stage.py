@@ -150,7 +150,11 @@ class StageDriver(Protocol):
         ...
 
     def position_m(self) -> Position:
-        """Where the stage stands, metres; while moving, where it was at most 0.2 s ago."""
+        """Where the stage stands, metres; while moving, where it was at most 0.2 s ago.
+
+        A driver that does not ask for it anew in each call has an attribute ``measured_ns``: when
+        it asked for the position that it told last, host clock. Poses are stamped with it.
+        """
         ...
 
     def state(self) -> StageState:
