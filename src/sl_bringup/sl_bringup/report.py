@@ -156,6 +156,7 @@ FIGURES: Mapping[str, tuple[str, str]] = {
     "edge_bound_px": ("Bound of the edge noise (Cramer-Rao, white noise)", "camera px"),
     "bound_ratio": ("Edge noise over that bound; the dark side is quieter than white noise", ""),
     "edge_blur_px": ("Blur of the edges", "camera px"),
+    "light_change": ("Most uneven light of two images of the same stripes", "of 1"),
     "scale_px": ("Camera pixels per DMD column", "px"),
     "median_gap_m": ("Camera and projector rays miss each other by (median)", "m"),
     "median_gap_px": ("Residual of the four equations (median)", "px"),

@@ -40,6 +40,8 @@ class Figures:
         Least standard deviation that an unbiased estimator can have on the same edges.
     order : float
         Median part of a row's boundaries that lie in order; 1 where all do.
+    light_change : float
+        Greatest part by which an image is brighter or darker than others of the same stripes.
     """
 
     edge_blur_px: float = float("nan")
@@ -49,6 +51,7 @@ class Figures:
     edge_sigma_px: float = float("nan")
     edge_bound_px: float = float("nan")
     order: float = float("nan")
+    light_change: float = float("nan")
 
     @property
     def bound_ratio(self) -> float:

@@ -17,6 +17,7 @@ from sl_reconstruct.cloud import CLOUD_DTYPE, Cloud, Figures, count_reasons
 from sl_reconstruct.crossed import Crossed, cross_rows, map_rows
 from sl_reconstruct.edges import Filter, Tuning
 from sl_reconstruct.filters import edge_filter, gaussian_taps, tap_variance
+from sl_reconstruct.frame_light import check_light
 from sl_reconstruct.full_scale import saturation_of
 from sl_reconstruct.geometry import geometry, ray_tile
 from sl_reconstruct.plan import AxisPlan, DecodePlan
@@ -112,7 +113,8 @@ class Reconstructor:
         ------
         StackError
             When number, shape or type of the images do not fit sequence and rig, or the images
-            contradict the sequence (exchanged, repeated or foreign frames).
+            contradict the sequence (exchanged, repeated or foreign frames) or were taken under
+            different light.
         """
         self._check(stack)
         with self._lock:
@@ -136,6 +138,10 @@ class Reconstructor:
             stack, column, self.plan.white, self.plan.black, saturation
         )
         out = _output(*lines.u_px.shape)
+        light = check_light(
+            stack, self.sequence, self.settings, saturation, figures.edge_blur_px, figures.scale_px
+        )
+        figures = replace(figures, light_change=light)
         columns = np.arange(column.size_px, dtype=np.float64) - 0.5
         screen = _screen(self.settings, figures)
 

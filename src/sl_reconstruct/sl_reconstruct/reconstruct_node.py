@@ -84,6 +84,7 @@ _SETTINGS = {
     "max_slope": "greatest slope of an edge over the one that the blur makes expect",
     "min_light": "least light under an edge as a part of its brighter side's",
     "max_gap_px": "greatest distance of the two rays of a point with rows, px; 0: any",
+    "max_light_change": "an image is at most so much brighter or darker than its like, a part",
 }
 
 

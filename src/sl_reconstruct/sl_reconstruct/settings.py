@@ -42,6 +42,10 @@ class Settings:
     max_gap_px : float, optional
         With rows: refuse points whose camera and projector rays miss each other by more than so
         many pixels. None refuses none.
+    max_light_change : float
+        A stack is refused when an image is brighter or darker than others of the same stripes by
+        more than this part; twice that is allowed to one without such, four times to white and
+        black, which move no edge. See ``frame_light``.
 
     Raises
     ------
@@ -59,6 +63,7 @@ class Settings:
     max_slope: float = 1.7
     min_light: float = 0.25
     max_gap_px: float | None = None
+    max_light_change: float = 0.03
 
     def __post_init__(self) -> None:
         if self.estimator not in get_args(Estimator):
@@ -74,6 +79,8 @@ class Settings:
                 f"min_slope={self.min_slope}, max_slope={self.max_slope}, "
                 f"max_jump_px={self.max_jump_px}; expected 0 <= min < max and a positive jump"
             )
+        if not self.max_light_change > 0:
+            raise ConfigError(f"max_light_change={self.max_light_change}; expected more than 0")
         for name in ("min_light", "min_spacing"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"{name}={getattr(self, name)}; expected 0 <= {name} < 1")
