@@ -13,7 +13,7 @@ from sl_projector.documents import written_atomically
 from sl_projector.errors import ConfigError, StackError
 from sl_reconstruct.measure.denoise import peak_to_valley
 from sl_reconstruct.measure.region import Region, select
-from sl_reconstruct.measure.result import Measurement
+from sl_reconstruct.measure.result import SIGNIFICANT, Measurement
 
 Array = NDArray[np.float64]
 
@@ -105,13 +105,17 @@ def measure_profile(
 def _uncertainty(
     residual_m: Array, sigma_m: Array, number: NDArray[np.int64], count: NDArray[np.int64]
 ) -> Array:
-    """Of each bin's mean: from the stated sigmas or the scatter, whichever is more."""
+    """Of each bin's mean: from the stated sigmas, or the scatter where it is clearly more.
+
+    Whichever is more would be too much: the scatter of few points is by chance.
+    """
     bins = len(count)
     n = np.maximum(count, 1)
     stated = np.bincount(number, sigma_m**2, bins) / n
     scatter = np.bincount(number, residual_m**2, bins) / np.maximum(count - 1, 1)
+    more = scatter > stated * (1.0 + SIGNIFICANT * np.sqrt(2.0 / np.maximum(count - 1, 1)))
     trusted = (count >= SCATTER_POINTS) | (stated == 0.0)
-    variance = np.where(trusted, np.maximum(stated, scatter), stated)
+    variance = np.where(trusted & more, scatter, stated)
     return np.asarray(np.sqrt(variance / n))
 
 

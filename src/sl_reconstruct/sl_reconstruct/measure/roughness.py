@@ -32,8 +32,8 @@ NUMBERS = ("Ssk", "Sku", "Sdr", "Sdq")
 #: Parameters to which noise adds as variances do.
 SQUARES = ("Sa", "Sq", "Sdq")
 EXTREMES = ("Sp", "Sv", "Sz")
-#: Repetitions of the points' noise that tell bias and uncertainty.
-DRAWS = 48
+#: Repetitions of the points' noise that tell bias and uncertainty; of extremes, as many as fit.
+DRAWS, MANY, HEIGHTS = 48, 120, 50_000_000
 MICROMETRE_M = 1e-6
 
 
@@ -201,7 +201,7 @@ def _corrected(
     estimate = Waves(noise)
     clean = estimate(inner)[0]
     told = areal_parameters(clean, height.step_m)
-    drawn = [areal_parameters(clean + draw, height.step_m) for draw in noise]
+    drawn = [areal_parameters(clean + draw, height.step_m) for draw in noise[:DRAWS]]
     found = {
         name: take_off(raw[name], told[name], np.array([one[name] for one in drawn]),
                        name in SQUARES)
@@ -223,11 +223,11 @@ def _shapes(raw: dict[str, float], found: dict[str, Corrected]) -> dict[str, Cor
 
 
 def _noise_maps(points: NDArray[Any], sigma: NDArray[Any], height: HeightMap) -> Array:
-    """Draws of the points' noise alone, (DRAWS, rows, columns) of the map without its border."""
+    """Draws of the points' noise alone, (n, rows, columns) of the map without its border."""
     rng = np.random.default_rng(0)
     alone = points.copy()
     maps = []
-    for _ in range(DRAWS):
+    for _ in range(int(np.clip(HEIGHTS / height.z_m.size, DRAWS, MANY))):
         noise = sigma * rng.standard_normal(points.shape, np.float32)
         alone["z"] = np.where(np.isfinite(points["z"]), noise, np.nan)
         z = make_height_map(alone, height.step_m).z_m
