@@ -21,8 +21,8 @@ from uncertainty_scenes import AROUND, SCENES, disc, z_scores
 #: Seeds of a scene; fewer where one measurement takes a third of a second. The table of all over
 #: 100 seeds: benchmarks/bench_uncertainty.py.
 SEEDS = dict.fromkeys(SCENES, 100) | {
-    "flatness of a flat": 6, "flatness of a bow": 8, "profile": 24, "roughness, wave": 6,
-    "roughness, ground": 6,
+    "flatness of a flat": 4, "flatness of a bow": 4, "profile": 16, "roughness, wave": 4,
+    "roughness, ground": 4,
 }  # fmt: skip
 #: Not among the tests: it repeats what a bow shows.
 SKIPPED = ("flatness, rough",)
