@@ -54,6 +54,8 @@ OUTLIER_PART, SIGMAS, SLACK_M = 1e-4, 6.0, 2e-6
 MISSING_PART = 0.02
 #: So far from where it stood for the clean clouds the stage may stand, after what it suffered.
 REPEATABILITY_M = 10e-6
+#: Where the stage stands for a scan, metres.
+HEIGHT_M = 0.0
 #: Scans after which everything that is made once has been made.
 WARM_SCANS = 20
 
@@ -319,7 +321,10 @@ class Soak:
         self.reasons: Counter[str] = Counter()
 
     def learn(self, sequences: list[str]) -> None:
-        """Make the clean clouds."""
+        """Make the clean clouds, where the stage is brought back to after each of its faults."""
+        moved = self._client.move(HEIGHT_M)
+        if moved is None or not moved.success:
+            raise SystemExit(f"the stage does not move: {moved and moved.message}")
         self._origin_m = self._stage_m()
         for sequence in sequences:
             answer = self._client.ask("scan", ANSWER_S, sequence=sequence, max_repeats=30)
@@ -444,7 +449,7 @@ class Soak:
     def _bring_home(self, index: int, what: Plan) -> None:
         if what.kind in ("alarm", "limit switch", "power cycle"):
             self._client.ask("stage/home", 120.0)
-        answer = self._client.move(0.0)
+        answer = self._client.move(HEIGHT_M)
         if answer is None or not answer.success:
             self._defect(index, what, f"no move afterwards: {answer and answer.message}")
 

@@ -16,6 +16,7 @@ import pytest
 from plyfile import PlyData
 
 from domains import ReservedDomain
+from processes import wait_until_ended
 from sl_bringup.graph_config import NODES
 from sl_bringup.transport import process_environment
 
@@ -166,8 +167,7 @@ def test_ctrl_c_ends_everything_cleanly(graph: Command) -> None:
     assert graph.end(signal.SIGINT) == 0, graph.text
     assert graph.text.count("process has finished cleanly") == len(pids)
     for pid in pids:
-        with pytest.raises(ProcessLookupError):
-            os.kill(pid, 0)
+        wait_until_ended(pid)
 
 
 def test_without_a_graph_the_scan_says_what_to_do(tmp_path: Path) -> None:
