@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sl_projector.errors import SequenceError, StackError
 from sl_projector.sequence import PatternSequence
+from sl_reconstruct.cloud import median
 from sl_reconstruct.plan import DecodePlan
 from sl_reconstruct.reconstruct import empty_lines, make_layout, survey
 from sl_reconstruct.rows import Lines, decode_rows, row_scratch
@@ -111,12 +112,8 @@ def correspondences(
         grid[good],
         np.stack([column[good], row[good]], axis=1),
         np.stack([sigma_c[good], sigma_r[good]], axis=1),
-        _median(columns.sigma_px[columns.reason == 0]),
+        median(columns.sigma_px[columns.reason == 0]),
     )
-
-
-def _median(values: NDArray[np.float32]) -> float:
-    return float(np.median(values)) if values.size else float("nan")
 
 
 def _grid(width: int, height: int, step_px: int, half_px: int) -> Array:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sl_projector.errors import StackError
 from sl_projector.sequence import PatternSequence
-from sl_reconstruct.cloud import CLOUD_DTYPE, Cloud, Figures, count_reasons
+from sl_reconstruct.cloud import CLOUD_DTYPE, Cloud, Figures, count_reasons, median
 from sl_reconstruct.crossed import Crossed, cross_rows, map_rows
 from sl_reconstruct.edges import Filter, Tuning
 from sl_reconstruct.filters import edge_filter, gaussian_taps, tap_variance
@@ -357,6 +357,6 @@ def figures_of(
     return Figures(
         edge_blur_px=state.blur_px, scale_px=t.scale * t.direction,
         noise_read_dn2=state.noise.read_dn2, noise_shot_dn=state.noise.shot_dn,
-        edge_sigma_px=float(np.median(sigma)) if sigma.size else float("nan"),
+        edge_sigma_px=median(sigma),
         edge_bound_px=float(state.bound_px / pairs), order=order,
     )  # fmt: skip
