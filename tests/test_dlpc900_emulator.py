@@ -101,6 +101,23 @@ def test_pattern_definition_limits(host, entry, code):
     assert host.define(**entry) == code
 
 
+# TI's table of block loads: 1, 2, 4 and 15 blocks of a DLP5500, 8 of a DLP9000.
+@pytest.mark.parametrize(
+    ("model", "blocks", "least_us"),
+    [
+        ("DLP5500", 1, 25), ("DLP5500", 2, 30), ("DLP5500", 4, 28), ("DLP5500", 15, 83),
+        ("DLP9000", 8, 61),
+    ],
+)  # fmt: skip
+def test_fewer_active_blocks_allow_shorter_exposures_of_one_bit(model, blocks, least_us):
+    host = Host(model)
+    assert host.write(0x1A1B, 3) == 0
+    assert host.write(0x1A40, 0, blocks) == 0
+    assert host.define(exposure_us=least_us) == 0
+    assert host.define(exposure_us=least_us - 1) == 14
+    assert host.define(exposure_us=303, options=0x72) == 14  # two bits
+
+
 def test_pattern_commands_need_a_pattern_mode(host):
     assert host.write(0x1A1B, 0) == 0
     assert host.define() == 5
@@ -313,6 +330,44 @@ def test_strict_device_forgets_images_with_another_table():
     assert host.write(0x1A24, 2) == 7
 
 
+def test_patterns_are_reordered_without_loading_them_again(host):
+    two_patterns(host)
+    order = struct.pack("<HI3H", 3, 5, 1, 1, 0)
+    assert host.write(0x1A32, *order) == 0
+    assert host.write(0x1A24, 2) == 0
+    host.finish()
+    assert [bool(mirrors.all()) for mirrors, *_ in host.edges] == [False, False, True] + [False] * 2
+    assert host.write(0x1A32, *struct.pack("<HI2H", 3, 5, 1, 1)) == 6  # an index is missing
+    assert host.write(0x1A32, *struct.pack("<HI1H", 1, 1, 2)) == 15  # never defined
+
+
+def test_mailbox_commands_of_tis_older_sdk_change_nothing(host):
+    two_patterns(host)
+    for command, *data in ((0x1A33, 2), (0x1A32, 0, 0), (0x1A33, 0)):
+        assert host.write(command, *data) == 0
+    assert host.write(0x1A24, 2) == 0
+    host.finish()
+    assert len(host.edges) == 2
+
+
+def test_inverted_data_turn_the_mirrors_over(host):
+    two_patterns(host)
+    for inverted in (1, 0):
+        assert host.write(0x1A30, inverted) == 0
+        assert host.device.pattern(0).all() == (not inverted)
+        assert host.device.pattern(1).any() == bool(inverted)
+
+
+def test_compressed_image_with_a_miscounted_header_is_shown_unless_strict(host):
+    """DMDConnect (Matlab) writes the number of pixels where the bytes are to be counted."""
+    stream = image(WHITE)
+    stream = stream[:8] + struct.pack("<I", 1024 * 768) + stream[12:]
+    assert host.upload(0, stream) == 0
+    strict = Host(strict=True)
+    assert strict.write(0x1A1B, 3) == 0
+    assert strict.upload(0, stream) == 6
+
+
 def test_flips_turn_the_mirrors(host):
     # The left half of the columns and the upper half of the rows are lit.
     row = bytes.fromhex("80 04 FFFFFF 80 04 000000")
@@ -402,3 +457,13 @@ def test_start_and_stop_in_any_order(host, order):
         assert host.read(command) == bytes([value & 1 if value < 3 else 0])
     assert host.write(0x0200, 0) == 0
     assert host.write(0x1A24, 2) == 0
+
+
+def test_pause_of_a_stopped_sequence_does_not_skip_patterns(host):
+    """Some hosts pause ("validate") before each start."""
+    two_patterns(host)
+    for count in (2, 4):
+        for value in (0, 1, 2):
+            assert host.write(0x1A24, value) == 0
+        host.finish()
+        assert len(host.edges) == count

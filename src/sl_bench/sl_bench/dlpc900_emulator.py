@@ -30,6 +30,7 @@ from sl_bench.dlpc900_refusal import (
     WRONG_MODE,
     Refusal,
 )
+from sl_bench.dlpc900_registers import ACTIVE_BLOCKS, INVERT_DATA, STORED
 from sl_bench.dlpc900_sequencer import Mirrors, OnExposure, Program, Sequencer, Slot
 from sl_projector.clock import Clock, SystemClock
 from sl_projector.dmd import DmdModel, dmd_model
@@ -38,20 +39,6 @@ REPORT = 64
 BUFFER = 512
 NACK = 0x20  # flag of a reply
 
-# Registers that are only stored: command, bytes at power-up.
-_STORED = {
-    0x1000: bytes(16),
-    0x1008: b"\x00",
-    0x1009: b"\x00",
-    0x1100: bytes(6),
-    0x1A00: b"\x00",
-    0x1A07: b"\x08",
-    0x1A1D: bytes(5),
-    0x1A1E: bytes(5),
-    0x1A35: struct.pack("<HB", 105, 0),
-    0x1A36: b"\x00",
-    0x1A40: b"\x00\x10",
-}
 _MAX_CACHED_PATTERNS = 64
 _MODE_PATTERNS = (1, 2, 3)
 _ON_THE_FLY = 3
@@ -74,8 +61,9 @@ class Dlpc900Emulator:
     camera_output : {2, 1}
         The trigger output that the camera is wired to: its rising-edge delay applies.
     strict : bool
-        Forget the images when the pattern table's images or count change, as the guide says
-        (many host programs do without).
+        Forget the images when the pattern table's images or count change, and refuse a compressed
+        image whose header miscounts its bytes, as the guide says (host programs that do neither
+        are in use).
     """
 
     def __init__(
@@ -143,10 +131,10 @@ class Dlpc900Emulator:
         with self._lock:
             self._sequencer.halt()
             self._sequencer.aborted = False
-            self._registers = dict(_STORED)
+            self._registers = dict(STORED)
             self._power, self._idle, self._mode = 0, 0, 1
             self._error, self._error_text = NO_ERROR, ""
-            self._memory = ImageMemory(self.model)
+            self._memory = ImageMemory(self.model, strict=self.strict)
             self._definitions: dict[int, Slot] = {}
             self._table: tuple[Slot, ...] = ()
             self._exposures = 0
@@ -260,6 +248,7 @@ class Dlpc900Emulator:
             0x1A2C: (6, lambda d: self._begin_image(1, d)),
             0x1A2D: (2, lambda d: self._memory.take(1, d)),
             0x1A31: (6, self._configure),
+            0x1A32: (2, self._reorder),
             0x1A34: (12, self._define),
         }
         if command in self._registers:
@@ -286,7 +275,7 @@ class Dlpc900Emulator:
             raise Refusal(BAD_DELAY)
         if 0x1A1D <= command <= 0x1A36:
             self._refuse_while_running()
-        if command in (0x1008, 0x1009):
+        if command in (0x1008, 0x1009, INVERT_DATA):
             self._cache.clear()
         self._registers[command] = data[:size]
 
@@ -345,12 +334,18 @@ class Dlpc900Emulator:
             raise Refusal(BAD_BIT)
         if slot.bit + slot.depth > _LAST_PLANE + 1:
             raise Refusal(BAD_DEFINITION, "bit position and depth leave the image")
-        if slot.exposure_us < self.model.min_exposure_us[min(slot.depth, 8) - 1]:
+        if slot.exposure_us < self._least_exposure_us(slot.depth):
             raise Refusal(BAD_EXPOSURE)
         if 0 < slot.dark_us < self.model.min_dark_us:
             raise Refusal(BAD_DARK)
         if self._mode == _ON_THE_FLY and slot.image >= MAX_FLY_IMAGES:
             raise Refusal(INVALID_PARAMETER, f"image {slot.image} on the fly")
+
+    def _least_exposure_us(self, depth: int) -> int:
+        if depth > 1:
+            return self.model.min_exposure_us[min(depth, 8) - 1]
+        loads_us = self.model.block_load_us
+        return loads_us[min(max(self._registers[ACTIVE_BLOCKS][1], 1), len(loads_us)) - 1]
 
     def _configure(self, data: bytes) -> None:
         if self._mode not in _MODE_PATTERNS:
@@ -369,6 +364,20 @@ class Dlpc900Emulator:
             self._cache.clear()
         self._table, self._exposures, self._paused_at = table, exposures, 0
 
+    def _reorder(self, data: bytes) -> None:
+        """Show defined patterns in another order, without defining or loading them again."""
+        if len(data) < 8:  # the mailbox address of TI's older SDK, of no meaning since
+            return
+        self._refuse_while_running()
+        count, exposures = struct.unpack_from("<HI", data)
+        order = [int.from_bytes(data[at : at + 2], "little") for at in range(6, len(data) - 1, 2)]
+        if not 1 <= count <= len(order):
+            raise Refusal(INVALID_PARAMETER, f"{len(order)} indices; it says {count}")
+        if any(index not in self._definitions for index in order[:count]):
+            raise Refusal(BAD_INDEX)
+        self._table = tuple(self._definitions[index] for index in order[:count])
+        self._exposures, self._paused_at = exposures, 0
+
     # -- mirrors -------------------------------------------------------------------------------
 
     def _begin_image(self, controller: int, data: bytes) -> None:
@@ -386,7 +395,7 @@ class Dlpc900Emulator:
             mirrors = self._memory.plane(*key)
             mirrors = mirrors[:, ::-1] if self._registers[0x1008][0] & 1 else mirrors
             mirrors = mirrors[::-1] if self._registers[0x1009][0] & 1 else mirrors
-            mirrors = np.ascontiguousarray(mirrors)
+            mirrors = np.ascontiguousarray(mirrors ^ bool(self._registers[INVERT_DATA][0] & 1))
             mirrors.flags.writeable = False
             self._cache[key] = mirrors
             if len(self._cache) > _MAX_CACHED_PATTERNS:
@@ -399,8 +408,9 @@ class Dlpc900Emulator:
         if data[0] == 2:
             self._start()
         elif data[0] == 1:
-            self._sequencer.halt()
-            self._paused_at = self._sequencer.exposure
+            if self.running:  # a pause before the first start, as some hosts send it, skips nothing
+                self._sequencer.halt()
+                self._paused_at = self._sequencer.exposure
         elif data[0] == 0:
             self._sequencer.halt()
             self._sequencer.aborted = False

@@ -131,7 +131,9 @@ def _uncompressed(data: bytes, width: int, height: int) -> NDArray[np.uint8]:
     raise ImageFault(6, f"{len(data)} bytes of pixels; expected {padded * height}")
 
 
-def decode_image(stream: bytes, width: int, height: int) -> NDArray[np.uint8]:
+def decode_image(
+    stream: bytes, width: int, height: int, *, strict: bool = True
+) -> NDArray[np.uint8]:
     """Decode header and data into bit planes.
 
     Parameters
@@ -142,6 +144,9 @@ def decode_image(stream: bytes, width: int, height: int) -> NDArray[np.uint8]:
         values of bytes 24 and 29.
     width, height : int
         What the controller drives; another size is a fault.
+    strict : bool
+        Whether a header that miscounts the bytes is a fault also where the data have an end mark
+        (compressions 1 and 2). DMDConnect for Matlab writes the number of pixels there.
 
     Returns
     -------
@@ -159,7 +164,7 @@ def decode_image(stream: bytes, width: int, height: int) -> NDArray[np.uint8]:
     if (columns, rows) != (width, height):
         raise ImageFault(6, f"image of {columns}x{rows}; expected {width}x{height}")
     data = stream[HEADER_BYTES:]
-    if counted not in (len(data), len(stream)):
+    if (strict or stream[25] == 0) and counted not in (len(data), len(stream)):
         raise ImageFault(6, f"header counts {counted} bytes; got {len(data)}")
     pixels = _pixels(stream[25], data, width, height)
     # On the wire planes 16-23 come first.

@@ -39,9 +39,12 @@ class ImageMemory:
     ----------
     model : DmdModel
         With two controllers each holds one half of the columns, the primary the left one.
+    strict : bool
+        As `decode_image`'s.
     """
 
-    def __init__(self, model: DmdModel) -> None:
+    def __init__(self, model: DmdModel, *, strict: bool = False) -> None:
+        self._strict = strict
         halves = 2 if model.dual else 1
         self._width, self._height = model.columns // halves, model.rows
         self._controllers = [_Controller() for _ in range(halves)]
@@ -95,6 +98,6 @@ class ImageMemory:
                 INVALID_PARAMETER, f"{len(upload.data)} bytes of image; announced {upload.total}"
             )
         try:
-            return decode_image(bytes(upload.data), self._width, self._height)
+            return decode_image(bytes(upload.data), self._width, self._height, strict=self._strict)
         except ImageFault as fault:
             raise Refusal(fault.code, fault.reason) from fault

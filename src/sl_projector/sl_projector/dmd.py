@@ -70,9 +70,10 @@ _BLOCKS_9000 = (24, 42, 42, 42, 45, 51, 56, 61, 67, 72, 77, 83, 88, 93, 99, 105)
 _DEPTHS_350 = (235, 700, 1570, 1700, 2000, 2500, 4500, 8333)
 _BLOCKS_5500 = (25, 30, 35, 28, 33, 38, 43, 48, 53, 58, 63, 68, 73, 78, 83)
 
-# Sizes of DLP670S and DLP500YX and their block tables are not confirmed by a second source; of
-# their tables only the last entry is used. For the DLP5500 the datasheet says 1024 patterns, the
-# programmer's guide 960 table entries: a controller that agrees with the guide answers error 15.
+# Sizes of DLP670S and DLP500YX and their block tables are not confirmed by a second source; the
+# driver always drives all blocks, so only the tables' last entries matter to it. For the DLP5500
+# the datasheet says 1024 patterns, the programmer's guide 960 table entries: a controller that
+# agrees with the guide answers error 15.
 MODELS: dict[str, DmdModel] = {
     m.name: m
     for m in (
