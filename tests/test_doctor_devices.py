@@ -130,6 +130,50 @@ def test_the_program_that_has_a_port_is_named(rig: Rig) -> None:
     assert f"(process {other.pid})" in finding.text
 
 
+def test_the_controller_of_the_configured_serial_number_is_looked_at(
+    on_usb: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_usb.configure("usb:EMU0001")  # the emulator's own, see test_usb_socket.py
+    assert on_usb.find("projector").level == "ok"
+    on_usb.configure("usb:EMU0002")
+    finding = on_usb.find("projector")
+    assert finding.level == "bad"
+    assert finding.text == "no DLPC900 of serial number 'EMU0002'; on the USB: EMU0001"
+    # One that may not be opened keeps its serial number to itself: it may be the one.
+    monkeypatch.setattr(doctor_devices, "_may_use", lambda node: node.name != "001")
+    assert "no permission" in on_usb.find("projector").text
+
+
+class Group:
+    """An entry of the group database."""
+
+    def __init__(self, name: str, members: list[str]) -> None:
+        self.gr_name, self.gr_mem = name, members
+
+
+def test_the_group_of_a_port_is_told(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not in it; in it but not logged in since; a number without a name, as in containers."""
+    port = tmp_path / "ttyUSB0"
+    port.touch()
+    rig.port = port
+    rig.configure(f"socket:{rig.socket}")
+    number = port.stat().st_gid
+    groups = {number: Group("dialout", [])}
+    monkeypatch.setattr(doctor_devices, "_may_use", lambda node: node != port)
+    monkeypatch.setattr(doctor_devices.grp, "getgrgid", groups.__getitem__)
+    monkeypatch.setenv("USER", "ada")
+    finding = rig.find("stage")
+    assert (finding.level, finding.text) == ("bad", f"you have no permission for {port}")
+    assert finding.remedy == "sudo usermod -aG dialout ada, then log out and in again"
+    groups[number] = Group("dialout", ["ada"])
+    assert "log in again" in rig.find("stage").remedy
+    assert "usermod" not in rig.find("stage").remedy
+    del groups[number]
+    assert rig.find("stage").remedy == f"in a container: start it with --group-add {number}"
+
+
 def test_a_controller_on_the_usb_without_permission(
     on_usb: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -176,8 +176,8 @@ def _calibration(file: str) -> Finding:
     return Finding("ok", "calibration", f"{file} ({calibration.hash[:12]})")
 
 
-def find_usb(vendor: int, product: int) -> Any:
-    """Return the USB device with these ids, or None.
+def find_usb(vendor: int, product: int) -> list[Any]:
+    """Return the USB devices with these ids.
 
     Raises
     ------
@@ -187,7 +187,7 @@ def find_usb(vendor: int, product: int) -> Any:
     import usb.core
 
     try:
-        return usb.core.find(idVendor=vendor, idProduct=product)
+        return list(usb.core.find(find_all=True, idVendor=vendor, idProduct=product))
     except usb.core.NoBackendError as error:
         raise DeviceError("libusb is not installed") from error
 

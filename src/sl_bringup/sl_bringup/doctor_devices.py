@@ -25,6 +25,7 @@ from sl_projector.dlpc350 import Dlpc350
 from sl_projector.dlpc900 import Dlpc900
 from sl_projector.dmd import DEFAULT_MODEL, MODELS, dmd_model
 from sl_projector.errors import DeviceLost, DeviceTimeout, SlError
+from sl_projector.transport import serial_number
 
 VENDOR = 0x0451
 #: USB product of each controller.
@@ -134,13 +135,9 @@ def _usb_projector(device: str, name: str, running: bool) -> list[Finding]:
         there = {c: find_usb(VENDOR, product) for c, product in CONTROLLERS.items()}
     except SlError as error:
         return [Finding("bad", "projector", str(error), "sudo apt install libusb-1.0-0")]
-    found = there[chip]
-    if found is not None:
-        node = USB_NODES / f"{found.bus:03d}" / f"{found.address:03d}"
-        if not _may_use(node):
-            return [_forbidden(chip, node)]
-        return [_projector_state(device, name, running, node)]
-    others = [other for other, other_found in there.items() if other_found is not None]
+    if there[chip]:
+        return [_chosen(there[chip], device, name, running)]
+    others = [other for other, found in there.items() if found]
     if others:
         models = [m.name for m in MODELS.values() if m.controller == others[0]]
         remedy = f"say dmd_model: {' or '.join(models)} in the configuration"
@@ -149,6 +146,26 @@ def _usb_projector(device: str, name: str, running: bool) -> list[Finding]:
     text = f"no {chip} ({VENDOR:04x}:{CONTROLLERS[chip]:04x}) on the USB; the configuration asks "
     remedy = "plug it in and switch it on (lsusb must list it); without hardware: add --bench"
     return [Finding("bad", "projector", text + f"for a {name}", remedy)]
+
+
+def _chosen(found: list[Any], device: str, name: str, running: bool) -> Finding:
+    """Of the controllers on the USB the one that the configuration means."""
+    chip, serial = MODELS[name].controller, device.partition(":")[2]
+    means = [one for one in found if not serial or serial_number(one) == serial]
+    closed = [one for one in found if not _may_use(_usb_node(one))]
+    if not means and not closed:
+        there = ", ".join(serial_number(one) or "none" for one in found)
+        text = f"no {chip} of serial number {serial!r}; on the USB: {there}"
+        remedy = "correct device in the configuration (usb: the first that is found)"
+        return Finding("bad", "projector", text, remedy)
+    node = _usb_node((means or closed)[0])
+    if not _may_use(node):
+        return _forbidden(chip, node)
+    return _projector_state(device, name, running, node)
+
+
+def _usb_node(device: Any) -> Path:
+    return USB_NODES / f"{device.bus:03d}" / f"{device.address:03d}"
 
 
 def _forbidden(chip: str, node: Path) -> Finding:
@@ -307,7 +324,9 @@ def _genicam(name: str) -> Finding:
         )
         return Finding("bad", "camera", str(error), remedy)
     except SlError as error:
-        return Finding("bad", "camera", str(error), ARAVIS_INSTALL)
+        return Finding(
+            "bad", "camera", str(error).removesuffix(f"; {ARAVIS_INSTALL}"), ARAVIS_INSTALL
+        )
     return Finding("ok", "camera", f"{found} (answering: {others or 'none'})")
 
 

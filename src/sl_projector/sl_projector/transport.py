@@ -122,15 +122,12 @@ class UsbHid:
         usb.util.dispose_resources(self._device)
 
 
-def _has_serial(serial: str) -> Any:
-    def matches(device: Any) -> bool:
-        # A device that cannot be opened has an unreadable serial number.
-        try:
-            return bool(usb.util.get_string(device, device.iSerialNumber) == serial)
-        except (usb.core.USBError, ValueError):
-            return False
-
-    return matches
+def serial_number(device: Any) -> str:
+    """Return a USB device's serial number; empty when it has none or may not be opened."""
+    try:
+        return usb.util.get_string(device, device.iSerialNumber) or ""
+    except (usb.core.USBError, ValueError):
+        return ""
 
 
 def open_usb(device: str, vendor: int, product: int, backend: Any = None) -> UsbHid:
@@ -159,11 +156,12 @@ def open_usb(device: str, vendor: int, product: int, backend: Any = None) -> Usb
         raise ConfigError(f"device {device!r}; expected 'usb', 'usb:SERIAL' or 'socket:PATH'")
     if kind == "socket":
         backend = LinkBackend(SocketLink(name))
-    match = _has_serial(name) if kind == "usb" and name else None
+    chosen = kind == "usb" and bool(name)
     try:
         found = usb.core.find(
-            idVendor=vendor, idProduct=product, backend=backend, custom_match=match
-        )
+            idVendor=vendor, idProduct=product, backend=backend,
+            custom_match=(lambda one: serial_number(one) == name) if chosen else None,
+        )  # fmt: skip
     except usb.core.NoBackendError as error:
         raise DeviceError("pyusb finds no libusb-1.0; install it (libusb-1.0-0)") from error
     except usb.core.USBError as error:
