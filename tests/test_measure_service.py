@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 import ros_graph
 
@@ -81,7 +84,10 @@ def test_a_region_and_a_quantity_are_judged(graph) -> None:
         tolerance=[-math.inf, 0.15],
     )  # fmt: skip
     assert (answer.success, answer.verdict, answer.names[1]) == (True, "fail", "a")
-    assert "fail" in answer.message
+    # The sentence says what was judged, to the digits that are known.
+    assert re.search(
+        r"^flatness .* µm \(k = 1\) .*; a 0\.200\d+ ± 0\.0000\d\d: fail$", answer.message
+    )
     corners = np.reshape(answer.region_used_m, (-1, 2))
     np.testing.assert_allclose(corners.min(axis=0), [0.2e-3, -1e-3])
     np.testing.assert_allclose(corners.max(axis=0), [1.8e-3, 1e-3])
@@ -107,7 +113,7 @@ def test_a_file_is_measured_and_compared(empty, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("request_", "word"),
     [
-        ({"kind": "volume"}, "volume"),
+        ({"kind": "volume"}, "profile, deviation"),
         ({"kind": ""}, "expected one of plane"),
         ({"kind": "plane", "region_m": [0.0, 0.0, 1.0]}, "3 numbers"),
         ({"kind": "plane", "region_m": [0.0, 0.0, math.nan, 1.0]}, "finite"),
@@ -134,3 +140,23 @@ def test_without_a_cloud_it_says_what_it_waits_for(empty) -> None:
     answer = call(empty, kind="groove")
     assert not answer.success
     assert "no cloud yet" in answer.message
+
+
+def stock_calls() -> list[tuple[str, str]]:
+    """Type and request of every call by the stock tools that the manual shows."""
+    root = Path(__file__).parents[1]
+    text = "".join(file.read_text() for file in [root / "README.md", *root.glob("docs/*.md")])
+    return re.findall(
+        r'^ros2 (?:service|action) .* (sl_interfaces/\S+) "(.*)"$', text, re.MULTILINE
+    )
+
+
+@pytest.mark.parametrize(("kind", "text"), stock_calls())
+def test_the_manuals_calls_fit_their_types(kind: str, text: str) -> None:
+    """To YAML 1.1, and so to the stock tools, 4e-3 is a word; they then refuse the request."""
+    package, group, name = kind.split("/")
+    found = getattr(importlib.import_module(f"{package}.{group}"), name)
+    types = getattr(found, "Request" if group == "srv" else "Goal").get_fields_and_field_types()
+    for field, value in yaml.safe_load(text).items():
+        words = [v for v in np.ravel(value).tolist() if isinstance(v, str)]
+        assert bool(words) == (types[field] == "string"), (field, value)

@@ -19,7 +19,7 @@ from sl_reconstruct.measure.deviation import map_reference, measure_deviation
 from sl_reconstruct.measure.features import FEATURES, Numbers, Points
 from sl_reconstruct.measure.planes import PlaneMeasurement
 from sl_reconstruct.measure.profile import ProfileMeasurement, save_profile
-from sl_reconstruct.measure.result import Measurement, Tolerance
+from sl_reconstruct.measure.result import Measurement, Tolerance, rounded
 from sl_reconstruct.measure.roughness import RoughnessMeasurement
 from sl_reconstruct.measure.x3p import save_x3p
 
@@ -168,7 +168,7 @@ def lines(found: Measurement) -> Iterator[str]:
              "angle": "included angle", "hole": "diameter", "profile": "height of section",
              "sphere": "radius", "cylinder": "radius", "step": "step height"}  # fmt: skip
     yield (
-        f"{names[found.kind]:<18}{_rounded(factor * found.value, factor * found.uncertainty)} "
+        f"{names[found.kind]:<18}{rounded(factor * found.value, factor * found.uncertainty)} "
         f"{unit} (standard uncertainty)"
     )
     aside = f", {found.set_aside:,} set aside" if found.set_aside else ""
@@ -195,27 +195,13 @@ def _details(found: Measurement) -> Iterator[str]:
     centre = getattr(found, "centre_m", None)
     if centre is not None:
         both = zip(centre, getattr(found, "u_centre_m", centre), strict=True)
-        yield f"{'  centre':<18}({', '.join(_rounded(1e3 * c, 1e3 * u) for c, u in both)}) mm"
+        yield f"{'  centre':<18}({', '.join(rounded(1e3 * c, 1e3 * u) for c, u in both)}) mm"
     if isinstance(found, RoughnessMeasurement):
         for name, value in found.corrected.items():
             length = name in ("Sa", "Sq", "Sp", "Sv", "Sz")
             factor, unit = (1e6, " µm") if length else (1.0, "")
             own, raw = factor * found.uncertainties[name], factor * found.raw[name]
-            yield f"  {name:<16}{_rounded(factor * value, own)}{unit} (with the noise {raw:.5g})"
-
-
-def _rounded(value: float, u: float) -> str:
-    """Value and uncertainty, the latter with two digits, the former to the same place.
-
-    Examples
-    --------
-    >>> _rounded(155.920213, 0.000123), _rounded(12.5, float("nan"))
-    ('155.92021 ± 0.00012', '12.5')
-    """
-    if not (math.isfinite(u) and u > 0.0 and math.isfinite(value)):
-        return f"{value:.6g}"
-    places = max(0, 1 - math.floor(math.log10(u)))
-    return f"{value:.{places}f} ± {u:.{places}f}"
+            yield f"  {name:<16}{rounded(factor * value, own)}{unit} (with the noise {raw:.5g})"
 
 
 def _plain(content: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sl_projector.documents import write_text
+from sl_reconstruct.measure.result import rounded
 
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2em auto; max-width: 64em; color: #222;
@@ -122,7 +123,7 @@ def _with_unit(value: float | None, unit: str, form: str = "") -> str | None:
 
 def _groove_rows(groove: Mapping[str, Any]) -> list[tuple[str, str]]:
     angle, u = groove["included_angle_deg"], groove["u_included_angle_deg"]
-    rows = [("Included angle", f"{angle:.4f}° ± {u:.4f}° (1 standard uncertainty)")]
+    rows = [("Included angle", f"{rounded(angle, u)} degrees (standard uncertainty, of noise)")]
     for side in ("left", "right"):
         plane = groove[side]
         normal = ", ".join(f"{n:+.5f}" for n in plane["normal"])

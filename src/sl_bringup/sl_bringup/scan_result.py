@@ -18,6 +18,7 @@ from sl_reconstruct.cloud import CLOUD_DTYPE, Cloud
 from sl_reconstruct.cloud_files import cloud_hash
 from sl_reconstruct.measure.groove import measure_groove
 from sl_reconstruct.measure.planes import AngleMeasurement
+from sl_reconstruct.measure.result import rounded
 from sl_reconstruct.reasons import Reason
 
 MEASURES = ("groove",)
@@ -164,6 +165,6 @@ def _groove_lines(report: Mapping[str, Any]) -> Iterator[str]:
             f"rms {micrometres(plane['rms_m'])}, {plane['points']:,} points"
         )
     angle, u = groove["included_angle_deg"], groove["u_included_angle_deg"]
-    yield f"included angle    {angle:.4f} degrees, standard uncertainty of noise {u:.5f}"
+    yield f"included angle    {rounded(angle, u)} degrees (standard uncertainty, of noise)"
     yield ""
     yield from table_2_lines(report)

@@ -36,39 +36,6 @@ class Feature(NamedTuple):
     measure: Callable[[Points, Numbers], Measurement]
 
 
-def measure_feature(kind: str, points: Points, numbers: Numbers) -> Measurement:
-    """Measure one feature of a cloud.
-
-    Parameters
-    ----------
-    kind : str
-        One of `FEATURES`.
-    points : ndarray, structured
-        The cloud: x, y, z and sigma in metres, NaN where there is no point.
-    numbers : tuple of float
-        Region as the kind wants it, metres; empty is everywhere, where the kind allows that.
-
-    Raises
-    ------
-    ConfigError
-        When the kind is unknown or the numbers are not what it wants.
-    StackError
-        When the cloud does not hold the feature.
-
-    Examples
-    --------
-    >>> measure_feature("volume", None, ())
-    Traceback (most recent call last):
-    sl_projector.errors.ConfigError: no measurement is called 'volume'; expected one of plane, \
-angle, groove, step, step-y, sphere, cylinder, hole, roughness, profile
-    """
-    if kind not in FEATURES:
-        raise ConfigError(
-            f"no measurement is called {kind!r}; expected one of {', '.join(FEATURES)}"
-        )
-    return FEATURES[kind].measure(points, numbers)
-
-
 def _region(numbers: Numbers) -> Region | None:
     return Region.of(numbers) if numbers else None
 

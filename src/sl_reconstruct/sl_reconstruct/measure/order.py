@@ -9,7 +9,7 @@ from typing import Literal
 from sl_projector.errors import ConfigError
 from sl_reconstruct.cloud_reading import read_height_map
 from sl_reconstruct.measure.deviation import map_reference, measure_deviation
-from sl_reconstruct.measure.features import Numbers, Points, measure_feature
+from sl_reconstruct.measure.features import FEATURES, Numbers, Points
 from sl_reconstruct.measure.region import Region
 from sl_reconstruct.measure.result import Measurement, Quantity, Tolerance, Verdict
 
@@ -45,6 +45,11 @@ class Order:
     tolerance: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.kind not in (*FEATURES, DEVIATION):
+            raise ConfigError(
+                f"no measurement is called {self.kind!r}; expected one of "
+                f"{', '.join(FEATURES)}, {DEVIATION}"
+            )
         if len(self.tolerance) not in (0, 2):
             raise ConfigError(f"tolerance {list(self.tolerance)}; expected [low, high] or nothing")
         if not all(math.isfinite(number) for number in self.region_m):
@@ -63,24 +68,26 @@ class Answer:
         The measurement.
     quantities : tuple of Quantity
         All its quantities, the value first.
+    judged : Quantity
+        The one that the tolerance is for.
     verdict : {"pass", "fail", "undecided", ""}
-        On the tolerance; empty where none was told.
+        On it; empty where no tolerance was told.
     """
 
     found: Measurement
     quantities: tuple[Quantity, ...]
+    judged: Quantity
     verdict: Verdict | Literal[""]
 
     @property
     def text(self) -> str:
         """One line a person can act on."""
-        first, found = self.quantities[0], self.found
-        unit = "" if first.unit == "1" else f" {first.unit}"
-        verdict = f"; tolerance: {self.verdict}" if self.verdict else ""
-        return (
-            f"{first.name} {first.value:.9g} ± {first.uncertainty:.2g}{unit} (k = 1) from "
-            f"{found.points} points{verdict}"
-        )
+        first = self.quantities[0]
+        line = f"{first.in_words()} (k = 1) from {self.found.points:,} points"
+        if not self.verdict:
+            return line
+        judged = "tolerance" if self.judged == first else self.judged.in_words()
+        return f"{line}; {judged}: {self.verdict}"
 
 
 def carry_out(order: Order, points: Points) -> Answer:
@@ -104,12 +111,12 @@ def carry_out(order: Order, points: Points) -> Answer:
         )
     judged = named[order.quantity] if order.quantity else quantities[0]
     verdict = limits.verdict(judged.value, judged.uncertainty) if limits else ""
-    return Answer(found, quantities, verdict)
+    return Answer(found, quantities, judged, verdict)
 
 
 def _measure(order: Order, points: Points) -> Measurement:
     if order.kind != DEVIATION:
-        return measure_feature(order.kind, points, order.region_m)
+        return FEATURES[order.kind].measure(points, order.region_m)
     reference = map_reference(read_height_map(order.reference_file))
     region = Region.of(order.region_m) if order.region_m else None
     return measure_deviation(points, reference, region, order.level)

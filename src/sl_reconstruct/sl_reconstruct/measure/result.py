@@ -12,6 +12,7 @@ points alike.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -44,6 +45,35 @@ class Quantity(NamedTuple):
     value: float
     uncertainty: float
     unit: str
+
+    def in_words(self) -> str:
+        """For people: lengths in millimetres from 1 mm on, else in micrometres.
+
+        Examples
+        --------
+        >>> Quantity("radius", 50.00083e-3, 1.1e-6, "m").in_words()
+        'radius 50.0008 ± 0.0011 mm'
+        >>> Quantity("a", -0.21328, 1.2e-6, "1").in_words()
+        'a -0.2132800 ± 0.0000012'
+        """
+        factor, unit = 1.0, "" if self.unit == "1" else f" {self.unit}"
+        if self.unit == "m":
+            factor, unit = (1e3, " mm") if abs(self.value) >= 1e-3 else (1e6, " µm")
+        return f"{self.name} {rounded(factor * self.value, factor * self.uncertainty)}{unit}"
+
+
+def rounded(value: float, u: float) -> str:
+    """Value and uncertainty, the latter with two digits, the former to the same place.
+
+    Examples
+    --------
+    >>> rounded(155.920213, 0.000123), rounded(12.5, float("nan"))
+    ('155.92021 ± 0.00012', '12.5')
+    """
+    if not (math.isfinite(u) and u > 0.0 and math.isfinite(value)):
+        return f"{value:.6g}"
+    places = max(0, 1 - math.floor(math.log10(u)))
+    return f"{value:.{places}f} ± {u:.{places}f}"
 
 
 @dataclass(frozen=True, kw_only=True)
