@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -314,6 +315,27 @@ def test_garbage_in_a_message_is_left_out_and_told(tmp_path: Path) -> None:
         assert not list(bag.messages())
         assert len(bag.lost) == 1
         assert "a message of 11 bytes on projector/trigger" in bag.lost[0]
+
+
+def test_a_topic_without_a_type_costs_only_itself(tmp_path: Path) -> None:
+    """mcap calls a schema's number 0 for none: written by mcap's own library."""
+    with new_bag(tmp_path / "bag") as bag:
+        bag.pose((0.001, -0.002, 0.003), START_NS)
+    with open_bag(tmp_path / "bag") as bag:
+        (pose,) = bag.raw(POSE)
+    definition = typestore().generate_msgdef(POSE.msgtype)[0].encode()
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = McapWriter(file)
+        writer.start(profile="ros2", library="test")
+        schema = writer.register_schema(POSE.msgtype, "ros2msg", definition)
+        for topic, number in ((POSE.name, schema), (IMAGE.name, 0)):
+            channel = writer.register_channel(f"/sl/{topic}", "cdr", number)
+            writer.add_message(channel, START_NS, bytes(pose.data), START_NS)
+        writer.finish()
+    with open_bag(tmp_path / "a.mcap") as bag:
+        (found,) = bag.messages(POSE, IMAGE)
+        assert found.message.pose.position.x == 0.001
+        assert bag.lost == ["a.mcap: what type /sl/camera/image_raw has cannot be read"]
 
 
 def test_two_rigs_need_a_name(tmp_path: Path) -> None:

@@ -29,23 +29,14 @@ from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import parse_qos
 
 from sl_bringup.mcap_records import (
-    CHANNEL,
-    CHUNK,
     CHUNK_HEAD,
-    CHUNK_INDEX,
-    DATA_END,
-    FOOTER,
     FOOTER_BODY,
     HEAD,
-    HEADER,
     INDEX_ENTRY,
     MAGIC,
-    MESSAGE,
     MESSAGE_HEAD,
-    MESSAGE_INDEX,
-    SCHEMA,
-    STATISTICS,
     Fields,
+    Op,
     zstd,
 )
 
@@ -162,7 +153,7 @@ class McapFile:
         if self._bytes(0, len(MAGIC)) != MAGIC:
             raise ReaderError("File magic is invalid." if self._size else "The file is empty.")
         opcode, start, length = self._record(len(MAGIC))
-        if opcode != HEADER or Fields(self._bytes(start, length)).text() != "ros2":
+        if opcode != Op.HEADER or Fields(self._bytes(start, length)).text() != "ros2":
             raise ReaderError("Profile is not ros2.")
         if not self._read_summary():
             self._scan(start + length)
@@ -174,7 +165,7 @@ class McapFile:
         tail = self._bytes(self._size - _TAIL_BYTES, _TAIL_BYTES)
         opcode, length = HEAD.unpack_from(tail)
         start, _, crc = FOOTER_BODY.unpack_from(tail, HEAD.size)
-        ended = tail[-len(MAGIC) :] == MAGIC and (opcode, length) == (FOOTER, FOOTER_BODY.size)
+        ended = tail[-len(MAGIC) :] == MAGIC and (opcode, length) == (Op.FOOTER, FOOTER_BODY.size)
         if not (ended and 0 < start < self._size):
             return False
         if crc and crc != zlib.crc32(self._bytes(start, self._size - _AFTER_CRC - start)):
@@ -201,7 +192,7 @@ class McapFile:
         end, whole, problem = start, False, ""
         try:
             for opcode, place, length in self._records(start, self._size):
-                if opcode in (FOOTER, DATA_END):
+                if opcode in (Op.FOOTER, Op.DATA_END):
                     whole = True
                     break
                 self._note(opcode, place, length)
@@ -226,29 +217,29 @@ class McapFile:
     def _record(self, start: int) -> tuple[int, int, int]:
         opcode, length = HEAD.unpack(self._bytes(start, HEAD.size))
         place = start + HEAD.size
-        if not HEADER <= opcode <= DATA_END or place + length > self._size:
+        if not Op.HEADER <= opcode <= Op.DATA_END or place + length > self._size:
             raise ReaderError(f"no whole record at byte {start}")
         return opcode, place, length
 
     def _note(self, opcode: int, place: int, length: int) -> None:
         """Note one record of a file without summary."""
         chunks = self._known.chunks
-        if opcode == CHUNK:
+        if opcode == Op.CHUNK:
             start_ns, end_ns, _, _ = CHUNK_HEAD.unpack(self._bytes(place, CHUNK_HEAD.size))
             chunks.append(_Chunk(start_ns, end_ns, place - HEAD.size, length + HEAD.size))
             self._take_from_chunk(chunks[-1])
-        elif opcode == MESSAGE:
+        elif opcode == Op.MESSAGE:
             channel, _, log_ns, _ = MESSAGE_HEAD.unpack(self._bytes(place, MESSAGE_HEAD.size))
             self._known.counts[channel] = self._known.counts.get(channel, 0) + 1
             self._note_bare(log_ns, place - HEAD.size, length + HEAD.size)
-        elif opcode == MESSAGE_INDEX and chunks:
+        elif opcode == Op.MESSAGE_INDEX and chunks:
             channel, bytes_ = struct.unpack("<HI", self._bytes(place, 6))
             counts = self._known.counts
             counts[channel] = counts.get(channel, 0) + bytes_ // INDEX_ENTRY.size
             if chunks[-1].indexes is None:
                 chunks[-1].indexes = {}
             chunks[-1].indexes[channel] = place - HEAD.size
-        elif opcode in (SCHEMA, CHANNEL):
+        elif opcode in (Op.SCHEMA, Op.CHANNEL):
             self._take(opcode, self._bytes(place, length))
 
     def _note_bare(self, log_ns: int, offset: int, length: int) -> None:
@@ -266,25 +257,25 @@ class McapFile:
         try:
             records, _ = self._unpacked(chunk, check=False, announcements=True)
             for opcode, start, length in _walk(records):
-                if opcode in (SCHEMA, CHANNEL):
+                if opcode in (Op.SCHEMA, Op.CHANNEL):
                     self._take(opcode, bytes(records[start : start + length]))
         except Exception:  # told when its messages are read
             return
 
     def _take(self, opcode: int, content: bytes) -> None:
         fields, known = Fields(content), self._known
-        if opcode == SCHEMA:
+        if opcode == Op.SCHEMA:
             (number,) = fields.unpack("H")
             known.schemas[number] = fields.text(), fields.text(), fields.raw().decode()
-        elif opcode == CHANNEL:
+        elif opcode == Op.CHANNEL:
             number, schema = fields.unpack("HH")
             if number not in known.channels:
                 known.channels[number] = self._connection(number, schema, fields)
-        elif opcode == CHUNK_INDEX:
+        elif opcode == Op.CHUNK_INDEX:
             start_ns, end_ns, offset, length = fields.unpack("QQQQ")
             entries = struct.iter_unpack("<HQ", fields.raw())
             known.chunks.append(_Chunk(start_ns, end_ns, offset, length, dict(entries) or None))
-        elif opcode == STATISTICS:
+        elif opcode == Op.STATISTICS:
             fields.unpack("QHIIIIQQ")
             known.counts = dict(struct.iter_unpack("<HQ", fields.raw()))
 
@@ -324,7 +315,7 @@ class McapFile:
                 self._lost(chunk, fault)
                 return []
             for opcode, start, length in _walk(records):
-                if opcode == MESSAGE:
+                if opcode == Op.MESSAGE:
                     channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(records, start)
                     if channel in wanted:
                         data = records[start + MESSAGE_HEAD.size : start + length]
@@ -353,7 +344,11 @@ class McapFile:
         place += len(head) - fields.left
         if place + stored > chunk.offset + chunk.length:
             raise ReaderError("its records reach beyond its end")
-        if announcements and not compression and HEAD.unpack(self._bytes(place, 9))[0] == MESSAGE:
+        if (
+            announcements
+            and not compression
+            and HEAD.unpack(self._bytes(place, 9))[0] == Op.MESSAGE
+        ):
             return memoryview(b""), ""
         packed = self._bytes(place, stored)
         records = memoryview(_DECOMPRESSORS[compression](packed))

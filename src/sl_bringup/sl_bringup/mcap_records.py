@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import sys
 from collections.abc import Mapping
+from enum import IntEnum
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -14,8 +15,14 @@ else:  # what rosbags itself depends on
 __all__ = ["zstd"]
 
 MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
-STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = 0x0B, 0x0C, 0x0D, 0x0E, 0x0F
+
+
+class Op(IntEnum):
+    """Opcodes: what a record is."""
+
+    HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
+    STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(0x0B, 0x10)
+
 
 #: Opcode and length of the content, before every record.
 HEAD = struct.Struct("<BQ")

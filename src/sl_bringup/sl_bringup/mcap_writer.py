@@ -16,25 +16,13 @@ from pathlib import Path
 from typing import BinaryIO
 
 from sl_bringup.mcap_records import (
-    CHANNEL,
-    CHUNK,
     CHUNK_HEAD,
-    CHUNK_INDEX,
-    DATA_END,
-    FOOTER,
     FOOTER_BODY,
     HEAD,
-    HEADER,
     INDEX_ENTRY,
     MAGIC,
-    MESSAGE,
     MESSAGE_HEAD,
-    MESSAGE_INDEX,
-    METADATA,
-    METADATA_INDEX,
-    SCHEMA,
-    STATISTICS,
-    SUMMARY_OFFSET,
+    Op,
     record,
     text,
     texts,
@@ -59,7 +47,7 @@ class _Chunk:
         self.began_s = time.monotonic()
 
     def add(self, channel: int, number: int, log_ns: int, publish_ns: int, data: bytes) -> None:
-        head = HEAD.pack(MESSAGE, MESSAGE_HEAD.size + len(data)) + MESSAGE_HEAD.pack(
+        head = HEAD.pack(Op.MESSAGE, MESSAGE_HEAD.size + len(data)) + MESSAGE_HEAD.pack(
             channel, number, log_ns, publish_ns
         )
         self.index[channel].append((log_ns, self.bytes))
@@ -93,8 +81,8 @@ class McapWriter:
         self._chunks: list[bytes] = []
         self.counts: dict[int, int] = {}
         self.start_ns, self.end_ns = 0, 0
-        self._file.write(MAGIC + record(HEADER, text("ros2"), text("slrig")))
-        self._metadata = self._file.tell(), record(METADATA, text("slrig"), texts(metadata))
+        self._file.write(MAGIC + record(Op.HEADER, text("ros2"), text("slrig")))
+        self._metadata = self._file.tell(), record(Op.METADATA, text("slrig"), texts(metadata))
         self._file.write(self._metadata[1])
         self._file.flush()
 
@@ -125,8 +113,10 @@ class McapWriter:
         number = len(self._channels) + 1
         kept = {"offered_qos_profiles": qos, "topic_type_hash": digest}
         ids = struct.pack("<H", number)
-        self._schemas.append(record(SCHEMA, ids, text(msgtype), text("ros2msg"), text(definition)))
-        self._channels.append(record(CHANNEL, ids, ids, text(topic), text("cdr"), texts(kept)))
+        self._schemas.append(
+            record(Op.SCHEMA, ids, text(msgtype), text("ros2msg"), text(definition))
+        )
+        self._channels.append(record(Op.CHANNEL, ids, ids, text(topic), text("cdr"), texts(kept)))
         self._file.write(self._schemas[-1] + self._channels[-1])
         self.counts[number] = 0
         return number
@@ -160,7 +150,7 @@ class McapWriter:
         stored = len(packed) if squeezed else chunk.bytes
         kind = text("zstd" if squeezed else "")
         head = CHUNK_HEAD.pack(*span, chunk.bytes, chunk.crc) + kind + struct.pack("<Q", stored)
-        self._file.write(HEAD.pack(CHUNK, len(head) + stored) + head)
+        self._file.write(HEAD.pack(Op.CHUNK, len(head) + stored) + head)
         self._file.writelines(parts)
         self._index_chunk(chunk, start, span, kind + struct.pack("<QQ", stored, chunk.bytes))
         self._file.flush()
@@ -173,30 +163,31 @@ class McapWriter:
             offsets += struct.pack("<HQ", channel, self._file.tell())
             packed = b"".join(INDEX_ENTRY.pack(*entry) for entry in entries)
             self._file.write(
-                record(MESSAGE_INDEX, struct.pack("<HI", channel, len(packed)), packed)
+                record(Op.MESSAGE_INDEX, struct.pack("<HI", channel, len(packed)), packed)
             )
         place = struct.pack("<QQQQ", *span, start, end - start)
         lengths = struct.pack("<I", len(offsets)), struct.pack("<Q", self._file.tell() - end)
-        self._chunks.append(record(CHUNK_INDEX, place, lengths[0], offsets, lengths[1], sizes))
+        self._chunks.append(record(Op.CHUNK_INDEX, place, lengths[0], offsets, lengths[1], sizes))
 
     def close(self) -> None:
         """Write the summary and close the file."""
         self._close_chunk()
-        self._file.write(record(DATA_END, struct.pack("<I", 0)))
+        self._file.write(record(Op.DATA_END, struct.pack("<I", 0)))
         summary, crc = self._file.tell(), 0
         offsets = b""
         for opcode, records in (
-            (SCHEMA, self._schemas), (CHANNEL, self._channels), (STATISTICS, [self._statistics()]),
-            (CHUNK_INDEX, self._chunks), (METADATA_INDEX, [self._metadata_index()]),
+            (Op.SCHEMA, self._schemas), (Op.CHANNEL, self._channels),
+            (Op.STATISTICS, [self._statistics()]), (Op.CHUNK_INDEX, self._chunks),
+            (Op.METADATA_INDEX, [self._metadata_index()]),
         ):  # fmt: skip
             start = self._file.tell()
             self._file.writelines(records)
             crc = zlib.crc32(b"".join(records), crc)
             if records:
                 place = struct.pack("<BQQ", opcode, start, self._file.tell() - start)
-                offsets += record(SUMMARY_OFFSET, place)
+                offsets += record(Op.SUMMARY_OFFSET, place)
         offsets_start = self._file.tell()
-        footer = HEAD.pack(FOOTER, FOOTER_BODY.size) + struct.pack("<QQ", summary, offsets_start)
+        footer = HEAD.pack(Op.FOOTER, FOOTER_BODY.size) + struct.pack("<QQ", summary, offsets_start)
         crc = zlib.crc32(footer, zlib.crc32(offsets, crc))
         self._file.write(offsets + footer + struct.pack("<I", crc) + MAGIC)
         self._file.close()
@@ -204,7 +195,7 @@ class McapWriter:
     def _statistics(self) -> bytes:
         counts = b"".join(struct.pack("<HQ", *item) for item in self.counts.items())
         return record(
-            STATISTICS,
+            Op.STATISTICS,
             struct.pack("<QHIIII", self.message_count, len(self._schemas), len(self._channels),
                         0, 1, len(self._chunks)),
             struct.pack("<QQI", self.start_ns, self.end_ns, len(counts)), counts,
@@ -212,4 +203,4 @@ class McapWriter:
 
     def _metadata_index(self) -> bytes:
         offset, written = self._metadata
-        return record(METADATA_INDEX, struct.pack("<QQ", offset, len(written)), text("slrig"))
+        return record(Op.METADATA_INDEX, struct.pack("<QQ", offset, len(written)), text("slrig"))
