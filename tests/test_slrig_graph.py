@@ -122,6 +122,18 @@ def test_an_interrupted_calibration_does_not_go_on_in_the_graph(
     graph.wait_for("calibration cancelled; stage and projector were stopped", 120.0)
 
 
+def test_a_calibration_that_nobody_waits_for_does_not_go_on(
+    graph: Command, ros_domain: int
+) -> None:
+    """A run of seven views takes longer than a second on any machine."""
+    cancelled = "calibration cancelled; stage and projector were stopped"
+    before = graph.text.count(cancelled)
+    command = Command("calibrate", "--domain", f"{ros_domain}", "--timeout", "1")
+    assert command.end(patience_s=120.0) == 1, command.text
+    assert "did not answer within 1 s" in command.text
+    graph.wait_for(cancelled, 120.0, times=before + 1)
+
+
 def test_scans_with_devices_that_fail_at_random(graph: Command, ros_domain: int) -> None:
     """A taste of ``benchmarks/soak_faults.py``: no wrong cloud, no dead node, all well again.
 

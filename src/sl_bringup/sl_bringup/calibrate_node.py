@@ -16,7 +16,6 @@ from sl_bringup.calibrate import outcome_lines
 from sl_bringup.client_node import GraphClient, run_client
 from sl_bringup.paper_tables import table_1_lines
 from sl_bringup.progress import say
-from sl_projector.errors import DeviceLost
 
 
 class CalibrateClient(GraphClient):
@@ -34,7 +33,7 @@ class CalibrateClient(GraphClient):
         self._verify = self.create_client(Verify, "calibration/verify")
 
     def calibrate(self, goal: Calibrate.Goal, connect_s: float, patience_s: float) -> Any:
-        """Calibrate, and return the action's result; an interrupt cancels the run.
+        """Calibrate, and return the action's result; cancelled as by `carry_out`.
 
         Raises
         ------
@@ -44,11 +43,7 @@ class CalibrateClient(GraphClient):
             When the graph does not answer in time.
         """
         self.await_graph(self._action.server_is_ready, "calibration/calibrate", connect_s)
-        asked = self._action.send_goal_async(goal, feedback_callback=self._feedback)
-        handle = self.answer(asked, patience_s)
-        if not handle.accepted:
-            raise DeviceLost("the graph refused the calibration")
-        return self.outcome(handle, patience_s)
+        return self.carry_out(self._action, goal, self._feedback, patience_s)
 
     def verify(self, request: Verify.Request, connect_s: float, patience_s: float) -> Any:
         """Check the calibration in force, and return the service's answer; errors as above."""

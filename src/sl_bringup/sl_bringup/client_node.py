@@ -70,21 +70,37 @@ class GraphClient(Node):  # type: ignore[misc]  # rclpy carries no types
             raise DeviceTimeout(f"the graph did not answer within {patience_s:g} s")
         return future.result()
 
-    def outcome(self, goal: Any, patience_s: float) -> Any:
-        """Return the result of a goal; an interrupt cancels it and waits for its end.
+    def carry_out(
+        self, action: Any, goal: Any, feedback: Callable[[Any], None], patience_s: float
+    ) -> Any:
+        """Ask an action for a goal, and return its result.
+
+        When it takes too long, and at an interrupt, it is cancelled and its end waited for:
+        nothing goes on in the graph for which nobody waits.
 
         Raises
         ------
+        DeviceLost
+            When the graph refuses the goal.
         DeviceTimeout
             When it does not end in time.
         """
-        result = goal.get_result_async()
+        asked = action.send_goal_async(goal, feedback_callback=feedback)
         try:
-            return self.answer(result, patience_s).result
-        except KeyboardInterrupt:
-            goal.cancel_goal_async()
-            self.until(result.done, CANCEL_S)
+            handle = self.answer(asked, patience_s)
+            if not handle.accepted:
+                raise DeviceLost(f"{self.get_namespace()}: the graph refused the goal")
+            return self.answer(handle.get_result_async(), patience_s).result
+        except (KeyboardInterrupt, DeviceTimeout):
+            self._cancel(asked)
             raise
+
+    def _cancel(self, asked: Any) -> None:
+        """Cancel a goal that may still be on its way, and wait for its end."""
+        if self.until(asked.done, CANCEL_S) and asked.result().accepted:
+            ended = asked.result().get_result_async()
+            asked.result().cancel_goal_async()
+            self.until(ended.done, CANCEL_S)
 
     def until(self, condition: Callable[[], bool], patience_s: float) -> bool:
         """Serve the node until a condition holds; whether it does in time."""

@@ -18,7 +18,6 @@ from sl_bringup.client_node import GraphClient, run_client
 from sl_bringup.progress import complain, say
 from sl_bringup.scan_result import MEASURES, check_cloud, live_report, summary, write_result
 from sl_projector.base_node import LARGE
-from sl_projector.errors import DeviceLost
 from sl_reconstruct.messages import cloud_from_msg
 
 #: The cloud is sent before the action's result; it may still be later by so long.
@@ -58,18 +57,14 @@ class ScanClient(GraphClient):
         )
 
     def scan(self, goal: Scan.Goal, patience_s: float) -> tuple[Any, PointCloud2 | None]:
-        """Scan, and return the action's result and the cloud; an interrupt cancels the scan.
+        """Scan, and return the action's result and the cloud; else as `carry_out`.
 
         Raises
         ------
         DeviceTimeout
             When the graph does not answer in time.
         """
-        asked = self._action.send_goal_async(goal, feedback_callback=self._feedback)
-        handle = self.answer(asked, patience_s)
-        if not handle.accepted:
-            raise DeviceLost("the graph refused the scan")
-        result = self.outcome(handle, patience_s)
+        result = self.carry_out(self._action, goal, self._feedback, patience_s)
         if result.success:
             self.until(lambda: self._cloud is not None, CLOUD_WAIT_S)
         return result, self._cloud
