@@ -225,6 +225,23 @@ def test_a_recording_that_lacks_a_stack_is_refused(bench: Bench, tmp_path: Path)
         solve_recorded(tmp_path / "bag", tmp_path / "again", look=seen)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("plate", None), ("plate", {"origin_id": [0, 0], "colour": "white"}), ("plate", "a plate"),
+     ("sequence", None), ("target", "stage")],
+)  # fmt: skip
+def test_a_recorded_run_that_makes_no_sense_is_refused(
+    bench: Bench, tmp_path: Path, name: str, value: object
+) -> None:
+    bench.calibrate()
+    made_from = {**bench.runs[0]["made_from"], name: value}
+    if value is None:
+        del made_from[name]
+    record(tmp_path / "bag", {**bench.runs[0], "made_from": made_from}, bench.rig.moves[:1])
+    with pytest.raises(CalibrationError, match="expected"):
+        solve_recorded(tmp_path / "bag", tmp_path / "again", look=look_with(bench.rig))
+
+
 def test_a_recording_that_tells_of_no_run_gives_all_its_stacks(
     bench: Bench, tmp_path: Path
 ) -> None:
@@ -259,8 +276,10 @@ def test_the_command_solves_a_run_again(
     bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     outcome = bench.calibrate(travel_m=0.5e-3)
-    run = Path(outcome.calibration_file).parent
-    assert main(["calibrate", "--from", str(run), "--output", str(tmp_path / "again")]) == 0
+    # Results go into the run's folder, whatever it is called.
+    run = Path(outcome.calibration_file).parent.rename(tmp_path / "plate.2026")
+    assert main(["calibrate", "--from", str(run)]) == 0
+    assert (run / "again" / "calibration.yaml").is_file()
     out = capsys.readouterr().out
     assert outcome.hash in out
     assert "stage squareness  xy" in out

@@ -189,7 +189,8 @@ def solve_again(source: Path, output: Path | None) -> int:
         run = source if source.is_dir() else source.with_suffix("")
         outcome = solve_stored(source, output or run / "again")
     else:
-        folder = output or Path(f"{source.stem}_calibration")
+        name = source.name if source.is_dir() else source.stem
+        folder = output or Path(f"{name}_calibration")
         outcome, notes = solve_recorded(source, folder, tell=complain)
     for line in [*outcome_lines(outcome), *notes]:
         say(line)

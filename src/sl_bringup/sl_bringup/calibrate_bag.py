@@ -40,6 +40,8 @@ class Run:
         Its stacks in order; empty: all that show both coordinates.
     made_from : mapping
         As the live run's calibration has it.
+    order : Order
+        What its views were taken for.
     pitches : Pitches
         Of the chips.
     limits : Limits
@@ -50,19 +52,20 @@ class Run:
 
     scan_ids: tuple[int, ...]
     made_from: Mapping[str, Any]
+    order: Order
     pitches: Pitches
     limits: Limits
     hash: str = ""
 
-    @property
-    def order(self) -> Order:
-        """What the views were taken for."""
-        plate = dict(self.made_from["plate"])
-        plate["origin_id"] = tuple(plate["origin_id"])
-        target = str(self.made_from.get("target", "both"))
-        patterns = target != "camera" or "kept" in self.made_from
-        sequence = str(self.made_from["sequence"])
-        return Order(target, (0.0,), Plate(**plate), sequence, patterns=patterns, least=1)
+
+def _order(made_from: Mapping[str, Any]) -> Order:
+    """What the views of a run were taken for."""
+    plate = dict(made_from["plate"])
+    plate["origin_id"] = tuple(plate["origin_id"])
+    target = str(made_from.get("target", "both"))
+    patterns = target != "camera" or "kept" in made_from
+    sequence = str(made_from["sequence"])
+    return Order(target, (0.0,), Plate(**plate), sequence, patterns=patterns, least=1)
 
 
 def solve_recorded(
@@ -125,7 +128,8 @@ def recorded_run(bag: Bag) -> Run | None:
         told = json.loads(texts[-1])
         return Run(
             tuple(int(number) for number in told["scan_ids"]), told["made_from"],
-            Pitches(**told["pitches"]), Limits(**told["limits"]), str(told["hash"]),
+            _order(told["made_from"]), Pitches(**told["pitches"]), Limits(**told["limits"]),
+            str(told["hash"]),
         )  # fmt: skip
     except (ValueError, TypeError, KeyError) as error:
         raise CalibrationError(
@@ -138,7 +142,7 @@ def _assumed(plate: Plate) -> Run:
     """Run of a recording that tells of none: everything in it that shows both coordinates."""
     order = Order("both", (0.0,), plate, "precise-rows", least=1)
     made_from = {**made_from_order(order), "heights_m": []}
-    return Run((), made_from, Pitches(1e-5, 1e-5), Limits())
+    return Run((), made_from, order, Pitches(1e-5, 1e-5), Limits())
 
 
 def _observations(bag: Bag, run: Run, look: Look, tell: Tell) -> Observations:
@@ -159,7 +163,7 @@ def _observations(bag: Bag, run: Run, look: Look, tell: Tell) -> Observations:
         )
     ordered = tuple(views[number] for number in run.scan_ids or sorted(views))
     made_from = dict(run.made_from)
-    made_from["heights_m"] = made_from["heights_m"] or sorted({v.height_m for v in ordered})
+    made_from["heights_m"] = made_from.get("heights_m") or sorted({v.height_m for v in ordered})
     pitches = run.pitches
     return Observations(ordered, *sizes, pitches.camera_m, pitches.projector_m, made_from)
 
