@@ -13,6 +13,7 @@ from sl_bringup.bag_writer import BagWriter, new_bag
 from sl_bringup.bags import CAMERA_SETTINGS, MATCHING, REPORT, SETTINGS, Topic, message_class
 from sl_camera.matching import MatcherSettings
 from sl_projector.errors import ConfigError
+from sl_reconstruct import full_scale
 from sl_reconstruct.calibration_file import Calibration
 from sl_reconstruct.settings import Settings
 from test_evaluate_many import START_NS, evaluate, live_report, summary, write_scans
@@ -94,6 +95,22 @@ def test_each_scan_gets_the_settings_of_its_live_cloud(
     assert [s["settings_hash"] for s in scans] == [first.hash(), second.hash()]
 
 
+def test_a_change_that_fits_only_some_of_the_settings_spoils_only_their_scans(
+    tmp_path: Path, stacks: list[np.ndarray]
+) -> None:
+    """min_slope=1.2 fits the settings in force at the end, not those of the first scan."""
+    first, second = Settings(max_slope=1.1), Settings(max_slope=1.7)
+    bag = record(
+        tmp_path / "bag", stacks[:2], (SETTINGS, first.to_dict()), (SETTINGS, second.to_dict()),
+        reports=(live_report(1, "a", first.hash(), ""), live_report(2, "b", second.hash(), "")),
+    )  # fmt: skip
+    out = "--output", tmp_path / "out", "--pictures", "none"
+    assert evaluate(bag, *out, "--set", "min_slope=1.2") == 1
+    one, two = reports(tmp_path / "out")
+    assert not one["good"] and "min_slope=1.2, max_slope=1.1" in one["reasons"][-1]
+    assert two["settings"]["min_slope"] == 1.2 and "points" in two
+
+
 def wide(stack: np.ndarray) -> np.ndarray:
     """8 bits as 12 in 16."""
     return stack.astype(np.uint16) * 16 + 15
@@ -101,14 +118,19 @@ def wide(stack: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("told", [True, False])
 def test_twelve_bits_need_no_setting(
-    tmp_path: Path, stacks: list[np.ndarray], capsys: pytest.CaptureFixture[str], told: bool
-) -> None:
+    tmp_path: Path, stacks: list[np.ndarray], capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch, told: bool,
+) -> None:  # fmt: skip
     """The camera's settings say where its pixels end; without them the values do, aloud."""
+    looked: list[int] = []
+    look = full_scale.full_scale_dn
+    monkeypatch.setattr(full_scale, "full_scale_dn", lambda s: looked.append(1) or look(s))
     camera = ((CAMERA_SETTINGS, {"pixel_format": "mono12", "full_scale_dn": 4095}),)
     bag = record(tmp_path / "bag", [wide(stacks[0])], *(camera if told else ()))
     assert evaluate(bag, "--output", tmp_path / "out", "--pictures", "none") == 0
     (report,) = reports(tmp_path / "out")
     assert report["saturation_dn"] == 4095
+    assert len(looked) == (not told)  # a pass over all pixels: once is enough
     assert report["settings"]["saturation_dn"] == (4095 if told else None)
     assert ("16 bits" in capsys.readouterr().err) is not told
 

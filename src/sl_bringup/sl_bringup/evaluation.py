@@ -210,8 +210,7 @@ class _BagRun:
 
     def _evaluate(self, decision: FrameDecision, folder: Path, first: bool) -> Report:
         """Report on one verdict; a scan that cannot be evaluated is reported, not raised."""
-        settings = self._settings_of(decision.scan_id)
-        report = {
+        report: Report = {
             "format": 1,
             "bag": self._bag.path.name,
             "scan_id": decision.scan_id,
@@ -221,18 +220,18 @@ class _BagRun:
             "reasons": [decision.reason] if decision.reason else [],
             "sequence": "",
             "software": software_version(),
-            "settings": settings.to_dict(),
-            "settings_hash": settings.hash(),
             "matching": self._matcher.settings.to_dict(),
         }
         cloud = None
-        if decision.stack is not None:
-            try:
+        try:
+            settings = self._settings_of(decision.scan_id)
+            report |= {"settings": settings.to_dict(), "settings_hash": settings.hash()}
+            if decision.stack is not None:
                 cloud = self._measure(report, decision.stack, settings)
-            except CalibrationError:
-                raise
-            except SlError as exc:
-                report["reasons"] = [str(exc)]
+        except CalibrationError:
+            raise
+        except SlError as exc:
+            report["reasons"].append(str(exc))
         self._write(folder, report, cloud, first)
         return report
 
@@ -248,7 +247,8 @@ class _BagRun:
         report["saturation_dn"] = saturation_of(stack.data, settings)
         notes = in_force.mismatch, _guessed(stack, settings, report["saturation_dn"])
         report["notes"] = [note for note in notes if note]
-        cloud = self._workshops.of(in_force, settings)(stack.data, stack.sequence).cloud
+        workshop = self._workshops.of(in_force, settings)
+        cloud = workshop(stack.data, stack.sequence, report["saturation_dn"]).cloud
         report.update(_result(cloud))
         report["live"] = self._live.compare(report)
         return cloud

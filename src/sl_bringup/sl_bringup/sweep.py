@@ -125,7 +125,7 @@ def _row(reports: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "median_sigma_m": _middle([r["median_sigma_m"] for r in measured]),
         "bound_ratio": _middle([r["figures"]["bound_ratio"] for r in measured]),
         "plane_rms_m": _middle([r["plane"]["rms_m"] for r in measured if "plane" in r]),
-        "settings_hash": reports[0]["settings_hash"] if reports else "",
+        "settings_hash": reports[0].get("settings_hash", "") if reports else "",
         "cloud_hashes": [r.get("cloud_hash", "") for r in reports],
     }
 

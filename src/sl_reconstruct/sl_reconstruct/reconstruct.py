@@ -96,13 +96,17 @@ class Reconstructor:
         self._lock = threading.Lock()
         self._scratch: dict[tuple[Any, ...], Lines] = {}
 
-    def __call__(self, stack: NDArray[np.uint8] | NDArray[np.uint16]) -> Cloud:
+    def __call__(
+        self, stack: NDArray[np.uint8] | NDArray[np.uint16], saturation_dn: int | None = None
+    ) -> Cloud:
         """Reconstruct one stack.
 
         Parameters
         ----------
         stack : ndarray, (N, H, W) of uint8 or uint16
             Images in pattern order, DN.
+        saturation_dn : int, optional
+            What `saturation_of` says of them, where it was asked already: a pass over all pixels.
 
         Returns
         -------
@@ -118,7 +122,8 @@ class Reconstructor:
         """
         self._check(stack)
         with self._lock:
-            return self._reconstruct(np.ascontiguousarray(stack))
+            saturation = saturation_dn or saturation_of(stack, self.settings)
+            return self._reconstruct(np.ascontiguousarray(stack), saturation)
 
     def _check(self, stack: NDArray[Any]) -> None:
         width, height = self.rig.camera.image_size
@@ -132,8 +137,8 @@ class Reconstructor:
                 f"sequence {self.sequence.name!r} from the rig's {width}x{height} camera"
             )
 
-    def _reconstruct(self, stack: NDArray[Any]) -> Cloud:
-        column, saturation = self.plan.column, saturation_of(stack, self.settings)
+    def _reconstruct(self, stack: NDArray[Any], saturation: int) -> Cloud:
+        column = self.plan.column
         _, lines, figures = self._decode(
             stack, column, self.plan.white, self.plan.black, saturation
         )

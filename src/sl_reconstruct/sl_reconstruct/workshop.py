@@ -65,7 +65,10 @@ class Workshop:
             self._made.clear()
 
     def __call__(
-        self, images: NDArray[np.uint8] | NDArray[np.uint16], sequence: PatternSequence
+        self,
+        images: NDArray[np.uint8] | NDArray[np.uint16],
+        sequence: PatternSequence,
+        saturation_dn: int | None = None,
     ) -> Product:
         """Make a cloud.
 
@@ -75,6 +78,8 @@ class Workshop:
             In pattern order.
         sequence : PatternSequence
             What was projected.
+        saturation_dn : int, optional
+            What `saturation_of` says of them, where it was asked already.
 
         Raises
         ------
@@ -85,7 +90,7 @@ class Workshop:
         """
         with self._lock:
             reconstructor, used = self._reconstructor(sequence), self._hash
-        return Product(reconstructor(images), used, self.settings_hash)
+        return Product(reconstructor(images, saturation_dn), used, self.settings_hash)
 
     def _reconstructor(self, sequence: PatternSequence) -> Reconstructor:
         if self._calibration is None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_projector.errors import StackError
 from sl_reconstruct.measure.region import Selection
-from sl_reconstruct.measure.result import Measurement, Quantity, uncertainties
+from sl_reconstruct.measure.result import Fitted, Measurement, Quantity, uncertainties
 from sl_reconstruct.plane_fit import TRIM_SD, robust_sd
 
 Array = NDArray[np.float64]
@@ -81,10 +81,8 @@ def measure_sphere(chosen: Selection) -> SphereMeasurement:
                         points.xyz_m[:, :2])  # fmt: skip
     u = np.sqrt(np.diag(fit.covariance))
     return SphereMeasurement(
-        kind="sphere", value=float(values[3]), uncertainty=float(u[3]), unit="m",
-        points=len(points), set_aside=len(chosen) - len(points), rms_m=fit.rms_m, dof=fit.dof,
-        inflation=fit.inflation, region=chosen.region, centre_m=tuple(values[:3].tolist()),
-        u_centre_m=tuple(u[:3].tolist()),
+        kind="sphere", **_of_radius(values[3], u[3], fit, chosen, points),
+        centre_m=tuple(values[:3].tolist()), u_centre_m=tuple(u[:3].tolist()),
     )  # fmt: skip
 
 
@@ -116,12 +114,21 @@ def measure_cylinder(chosen: Selection) -> CylinderMeasurement:
     direction, point = direction @ frame, point @ frame + centre
     direction = direction if tuple(direction[:2]) > (0.0, 0.0) else -direction
     return CylinderMeasurement(
-        kind="cylinder", value=float(values[4]),
-        uncertainty=float(np.sqrt(fit.covariance[4, 4])), unit="m", points=len(points),
-        set_aside=len(chosen) - len(points), rms_m=fit.rms_m, dof=fit.dof,
-        inflation=fit.inflation, region=chosen.region, point_m=tuple(point.tolist()),
-        direction=tuple(direction.tolist()),
+        kind="cylinder",
+        **_of_radius(values[4], np.sqrt(fit.covariance[4, 4]), fit, chosen, points),
+        point_m=tuple(point.tolist()), direction=tuple(direction.tolist()),
     )  # fmt: skip
+
+
+def _of_radius(
+    radius_m: float, u_m: float, fit: Fitted, chosen: Selection, used: Selection
+) -> dict[str, Any]:
+    """Fields that spheres and cylinders have alike."""
+    return {
+        "value": float(radius_m), "uncertainty": float(u_m), "unit": "m", "points": len(used),
+        "set_aside": len(chosen) - len(used), "rms_m": fit.rms_m, "dof": fit.dof,
+        "inflation": fit.inflation, "region": chosen.region,
+    }  # fmt: skip
 
 
 def fit_rounds(
