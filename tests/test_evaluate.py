@@ -165,12 +165,12 @@ def test_the_page_holds_everything_in_itself(
     bag = record(tmp_path / "<b>&bag", sequence, frames, rig=tiny_rig())
     evaluate(bag, tmp_path / "out")
     page = Page((tmp_path / "out" / "scan_0001" / "report.html").read_text())
-    assert len(page.sources) == 5
+    assert len(page.sources) == 6
     assert all(source.startswith("data:image/png;base64,") for source in page.sources)
     assert "Scan 1 of <b>&bag" in page.text
     assert "Good" in page.text
     pictures = sorted(p.name for p in (tmp_path / "out" / "scan_0001").glob("picture_*.png"))
-    assert len(pictures) == 5
+    assert len(pictures) == 6
 
 
 def test_the_same_bag_gives_the_same_bits(

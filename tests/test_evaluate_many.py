@@ -112,7 +112,7 @@ def test_pictures_of_the_first_scan_only(tmp_path: Path, stacks: list[np.ndarray
     bag = record(tmp_path / "bag", stacks[:2])
     assert evaluate(bag, "--output", tmp_path / "out", "--pictures", "first") == 0
     pictures = sorted(p.parent.name for p in tmp_path.glob("out/scan_*/picture_*.png"))
-    assert pictures == ["scan_0001"] * 5
+    assert pictures == ["scan_0001"] * 6
     assert len(list(tmp_path.glob("out/scan_*/report.html"))) == 2
 
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from matplotlib.colors import to_rgb
+from matplotlib import colormaps
+from matplotlib.colors import to_hex, to_rgb
 
 from sl_bringup.pictures import (
     ABSENT_COLOUR,
     MISSING_COLOUR,
     PRESENT_COLOUR,
     REASON_COLOURS,
+    SATURATED_COLOUR,
+    contrast_picture,
     height_picture,
     profile_picture,
     refusal_picture,
@@ -116,6 +119,22 @@ def test_single_refused_points_can_be_seen_in_a_large_map() -> None:
 
 #: #56B4E9 at 60 % on white.
 BAND = "#9ad2f2"
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_contrast_is_that_of_the_images_and_marks_what_is_saturated(dtype: type) -> None:
+    """Left no contrast, middle all of it but one step, a quarter on the right saturated."""
+    full = int(np.iinfo(dtype).max)
+    images = np.full((3, 120, 160), full // 2, dtype)
+    images[0, :, 40:120], images[2, :, 40:120] = 0, full - 1
+    images[1, :, 120:] = full
+    picture = pixels(contrast_picture(images, full, "t"))
+    levels = [to_hex(colormaps["viridis"](part)) for part in (0.0, (full - 1) / full)]
+    none, most, red = (share(picture, colour) for colour in (*levels, SATURATED_COLOUR))
+    # A quarter, a half and a quarter of the axes; the colour bar has little of each.
+    assert none == pytest.approx(red, rel=0.05)
+    assert most == pytest.approx(2 * red, rel=0.05)
+    assert red > 0.1
 
 
 def test_profile_shows_its_band() -> None:

@@ -232,7 +232,7 @@ class _BagRun:
             raise
         except SlError as exc:
             report["reasons"].append(str(exc))
-        self._write(folder, report, cloud, first)
+        self._write(folder, report, cloud, decision.stack, first)
         return report
 
     def _settings_of(self, scan_id: int) -> Settings:
@@ -253,11 +253,13 @@ class _BagRun:
         report["live"] = self._live.compare(report)
         return cloud
 
-    def _write(self, folder: Path, report: Report, cloud: Cloud | None, first: bool) -> None:
+    def _write(
+        self, folder: Path, report: Report, cloud: Cloud | None, stack: MatchedStack | None,
+        first: bool,
+    ) -> None:  # fmt: skip
         pictures = self._choices.pictures
-        drawn = write_scan(
-            folder, report, cloud, pictures == "all" or (pictures == "first" and first)
-        )
+        wanted = pictures == "all" or (pictures == "first" and first)
+        drawn = write_scan(folder, report, cloud, wanted, stack.data if stack else None)
         write_json(folder / "report.json", report)
         if pictures != "none":
             write_page(folder / "report.html", report, drawn)

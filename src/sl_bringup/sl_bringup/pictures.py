@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LightSource, ListedColormap
 from matplotlib.figure import Figure
@@ -33,6 +34,7 @@ REASON_COLOURS = (
     "#000000",
 )  # fmt: skip
 PRESENT_COLOUR = "#CFE8CF"
+SATURATED_COLOUR = "#FF0000"
 
 
 def height_picture(height: HeightMap, title: str) -> bytes:
@@ -94,7 +96,8 @@ def profile_picture(points: NDArray[Any], title: str) -> bytes:
     )  # fmt: skip
     above.plot(x_mm, z_m * factor, color="#0072B2", linewidth=0.8, label="measured")
     above.set(ylabel=f"height z / {unit}", title=f"{title}\nsection along camera row {row}")
-    above.legend(loc="best", frameon=False)
+    # Outside: "best" knows nothing of lines with gaps, and lay over one.
+    figure.legend(loc="outside lower center", ncols=2, frameon=False)
     below.plot(x_mm, 2 * sigma_m * sigma_factor, color="#D55E00", linewidth=0.8)
     below.set(xlabel="x / mm", ylabel=f"2 sigma of z / {sigma_unit}", ylim=(0, None))
     for axes in (above, below):
@@ -135,6 +138,31 @@ def refusal_picture(
     shown = [(name, colour) for name, colour in entries if counts.get(name)]
     handles = [Patch(color=colour, label=f"{name}: {counts[name]:,}") for name, colour in shown]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
+    return png(figure)
+
+
+def contrast_picture(images: NDArray[Any], saturation_dn: int, title: str) -> bytes:
+    """Contrast of the patterns in every camera pixel: brightest less darkest image.
+
+    Parameters
+    ----------
+    images : ndarray, (N, H, W), uint8 or uint16
+        Of one scan, DN.
+    saturation_dn : int
+        Full scale, DN; pixels that reach it are marked.
+    title : str
+        What was scanned.
+    """
+    bright, dark = images.max(axis=0), images.min(axis=0)
+    full = bright >= saturation_dn
+    contrast = (bright - dark) * np.float32(100.0 / saturation_dn)
+    colours = colormaps["viridis"].with_extremes(bad=SATURATED_COLOUR)
+    figure = Figure(figsize=(9, 1.2 + 7.2 * full.shape[0] / full.shape[1]), layout="constrained")
+    axes = figure.subplots()
+    told = f"brightest less darkest image (red: saturated, {100 * full.mean():.2g} %)"
+    image = axes.imshow(np.where(full, np.nan, contrast), cmap=colours, vmin=0.0, vmax=100.0)
+    axes.set(xlabel="camera column / px", ylabel="camera row / px", title=f"{title}\n{told}")
+    figure.colorbar(image, ax=axes, shrink=0.9, label="contrast / % of full scale")
     return png(figure)
 
 

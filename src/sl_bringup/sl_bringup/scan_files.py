@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sl_projector.documents import written_atomically
 from sl_projector.errors import StackError
@@ -15,15 +16,21 @@ from sl_reconstruct.height_map import HeightMap, make_height_map, save_png, save
 from sl_reconstruct.plane_fit import Plane, fit_plane
 from sl_reconstruct.reasons import REFUSALS, Reason
 
+#: Captions and PNG by file name.
+Drawn = dict[str, tuple[str, bytes]]
 #: Points that a plane is fitted to, about; more change nothing.
 PLANE_POINTS = 100_000
 FILES = ("cloud.ply", "cloud.pcd", "height.tiff", "height.png", "report.json", "report.html")
 PICTURES = ("picture_height", "picture_relief", "picture_residual", "picture_profile",
-            "picture_refusals")  # fmt: skip
+            "picture_refusals", "picture_contrast")  # fmt: skip
 
 
 def write_scan(
-    folder: Path, report: dict[str, Any], cloud: Cloud | None, with_pictures: bool
+    folder: Path,
+    report: dict[str, Any],
+    cloud: Cloud | None,
+    with_pictures: bool,
+    images: NDArray[Any] | None = None,
 ) -> dict[str, bytes]:
     """Write a scan's cloud, height map and pictures; files of an earlier evaluation go first.
 
@@ -37,6 +44,8 @@ def write_scan(
         None where the scan was refused.
     with_pictures : bool
         Whether pictures are drawn.
+    images : ndarray, (N, H, W), optional
+        What the cloud was made of: their contrast is drawn, above all where there is no cloud.
 
     Returns
     -------
@@ -45,20 +54,29 @@ def write_scan(
     """
     clear_scan(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    if cloud is None:
-        return {}
+    title = f"{report['bag']}, scan {report['scan_id']}"
+    drawn = {} if cloud is None else _write_cloud(folder, report, cloud, with_pictures, title)
+    if with_pictures and images is not None and "saturation_dn" in report:
+        from sl_bringup import pictures
+
+        contrast = pictures.contrast_picture(images, report["saturation_dn"], title)
+        drawn["picture_contrast"] = "Pattern contrast", contrast
+    for name, (_, png) in drawn.items():
+        with written_atomically(folder / f"{name}.png") as partial:
+            partial.write_bytes(png)
+    return dict(drawn.values())
+
+
+def _write_cloud(
+    folder: Path, report: dict[str, Any], cloud: Cloud, with_pictures: bool, title: str
+) -> Drawn:
+    """Write cloud and height map, and draw them."""
     notes = {key: report[key] for key in ("calibration_hash", "settings_hash", "cloud_hash")}
     save_ply(folder / "cloud.ply", cloud.points, notes)
     save_pcd(folder / "cloud.pcd", cloud.points, notes, organised=True)
     plane = _best_plane(cloud, report)
     height = _height_map(folder, cloud, report)
-    if not with_pictures:
-        return {}
-    drawn = _draw(cloud, height, plane, f"{report['bag']}, scan {report['scan_id']}")
-    for name, (_, png) in drawn.items():
-        with written_atomically(folder / f"{name}.png") as partial:
-            partial.write_bytes(png)
-    return dict(drawn.values())
+    return _draw(cloud, height, plane, title) if with_pictures else {}
 
 
 def clear_scan(folder: Path) -> None:
@@ -106,9 +124,7 @@ def _height_map(folder: Path, cloud: Cloud, report: dict[str, Any]) -> HeightMap
     return height
 
 
-def _draw(
-    cloud: Cloud, height: HeightMap | None, plane: Plane | None, title: str
-) -> dict[str, tuple[str, bytes]]:
+def _draw(cloud: Cloud, height: HeightMap | None, plane: Plane | None, title: str) -> Drawn:
     """Pictures by file name, each with its caption."""
     from sl_bringup import pictures  # imported late: half a second that clouds alone do without
 
