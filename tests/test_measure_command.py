@@ -15,6 +15,7 @@ from sl_reconstruct.cloud import CLOUD_DTYPE
 from sl_reconstruct.cloud_files import save_pcd, save_ply
 from sl_reconstruct.cloud_reading import read_cloud
 from sl_reconstruct.height_map import make_height_map, save_tiff
+from test_pictures import pixels
 
 
 @pytest.fixture
@@ -108,12 +109,42 @@ def test_every_measurement_has_its_option(groove, tmp_path, capsys) -> None:
 @pytest.mark.parametrize(
     "options",
     [[], ["--tolerance", "1:2"], ["--plane=0,0,1"], ["--csv", "x.csv", "--groove"],
-     ["--plane=50,50,60,60"], ["--angle=0,0,1,1"]],
+     ["--plane=50,50,60,60"], ["--angle=0,0,1,1"], ["--groove", "--picture", "x.png"],
+     ["--groove", "--region=0,0,1,1"]],
 )  # fmt: skip
 def test_requests_that_make_no_sense_are_refused(options, groove, tmp_path, capsys) -> None:
     save_pcd(tmp_path / "cloud.pcd", groove, organised=True)
     assert main(["measure", str(tmp_path / "cloud.pcd"), *options]) == 1
     assert "expected" in capsys.readouterr().err
+
+
+def test_a_map_of_deviations_and_a_section_are_drawn(groove, tmp_path, capsys) -> None:
+    """A bump of 3 um on the groove: red where it is, and nothing anywhere else of that colour."""
+    save_pcd(tmp_path / "cloud.pcd", groove, organised=True)
+    height = make_height_map(groove)
+    save_tiff(tmp_path / "height.tiff", height)
+    grid = {"x0_m": height.x0_m, "y0_m": height.y0_m, "step_m": height.step_m}
+    (tmp_path / "report.json").write_text(json.dumps({"height_map": grid}))
+    bumped = groove.copy()
+    bumped["z"] += 3e-6 * (np.hypot(groove["x"] - 1e-3, groove["y"]) < 0.4e-3)
+    save_pcd(tmp_path / "bumped.pcd", bumped, organised=True)
+    common = ["measure", str(tmp_path / "bumped.pcd"), "--reference", str(tmp_path / "height.tiff")]
+    assert main([*common, "--picture", str(tmp_path / "map.png")]) == 0
+    red, green, blue = np.moveaxis(pixels((tmp_path / "map.png").read_bytes()).astype(int), -1, 0)
+    rows, columns = np.nonzero((red - blue > 60) & (red - green > 60))
+    inside = columns < 0.8 * red.shape[1]  # right of it is the colour bar
+    # x = 1 mm of -2 to 2 mm: three quarters of the way across the axes.
+    assert 0.5 < columns[inside].mean() / (0.8 * red.shape[1]) < 0.9
+    assert 0.3 < rows[inside].mean() / red.shape[0] < 0.7
+    assert "form" in capsys.readouterr().out
+    here = ["--region=-1.8,-1,-0.2,1", "--json", str(tmp_path / "found.json")]
+    assert main([*common, *here]) == 0
+    found = json.loads((tmp_path / "found.json").read_text())["measurements"][0]
+    # The bump lies outside; both sides have the same noise, and the map's interpolation at a slope.
+    assert found["peak_m"] < 2e-6 and len(found["region"]["corners_m"]) == 4
+    section = ["--profile=-1.5,0,1.5,0,0.5", "--picture", str(tmp_path / "section.png")]
+    assert main(["measure", str(tmp_path / "cloud.pcd"), *section]) == 0
+    assert min(pixels((tmp_path / "section.png").read_bytes()).shape[:2]) > 200
 
 
 def test_an_unorganised_cloud_says_what_it_cannot_give(groove, tmp_path, capsys) -> None:

@@ -12,13 +12,19 @@ import numpy as np
 
 from sl_bringup.progress import say
 from sl_bringup.report import write_json
+from sl_projector.documents import written_atomically
 from sl_projector.errors import ConfigError, StackError
 from sl_reconstruct.cloud_reading import read_cloud, read_height_map
 from sl_reconstruct.height_map import make_height_map
-from sl_reconstruct.measure.deviation import map_reference, measure_deviation
-from sl_reconstruct.measure.features import FEATURES, Numbers, Points
+from sl_reconstruct.measure.deviation import (
+    DeviationMeasurement,
+    map_reference,
+    measure_deviation,
+)
+from sl_reconstruct.measure.features import FEATURES, RECTANGLE, Numbers, Points
 from sl_reconstruct.measure.planes import PlaneMeasurement
 from sl_reconstruct.measure.profile import ProfileMeasurement, save_profile
+from sl_reconstruct.measure.region import Region
 from sl_reconstruct.measure.result import Measurement, Tolerance, rounded
 from sl_reconstruct.measure.roughness import RoughnessMeasurement
 from sl_reconstruct.measure.x3p import save_x3p
@@ -91,6 +97,13 @@ def add_parser(subparsers: Any) -> None:
         "--tolerance", type=tolerance_of, metavar="LOW:HIGH",
         help="limits of the value, in the unit in which it is told; one measurement only",
     )  # fmt: skip
+    parser.add_argument(
+        "--region", type=numbers_of, metavar=RECTANGLE, help="where to compare (default: all over)"
+    )
+    parser.add_argument(
+        "--picture", type=Path, metavar="PNG",
+        help="draw the section with its uncertainty, or the map of deviations",
+    )  # fmt: skip
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all results")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the section's points")
     parser.add_argument("--x3p", type=Path, metavar="FILE", help="write the height map as X3P")
@@ -106,6 +119,10 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"--tolerance with {len(wanted)} measurements; expected one")
     if args.csv is not None and args.profile is None:
         raise ConfigError("--csv writes a section; expected --profile as well")
+    if args.picture is not None and (args.profile is None) == (args.reference is None):
+        raise ConfigError("--picture draws one thing; expected --profile or --reference as well")
+    if args.region is not None and args.reference is None:
+        raise ConfigError("--region says where to compare; expected --reference as well")
     points = read_cloud(args.cloud)
     verdicts, results = [], []
     for measure in wanted:
@@ -119,6 +136,8 @@ def run(args: argparse.Namespace) -> int:
         results.append({**_plain(found.to_dict()), "verdict": verdict or None})
         if isinstance(found, ProfileMeasurement) and args.csv is not None:
             save_profile(args.csv, found)
+        if args.picture is not None:
+            _draw(args.picture, points, found, args.cloud.name)
     if args.x3p is not None:
         _write_x3p(args.x3p, points)
     if args.json is not None:
@@ -135,7 +154,8 @@ def _wanted(args: argparse.Namespace) -> list[Callable[[Points], Measurement]]:
             wanted.append(lambda p, f=feature, n=numbers: f.measure(p, n))  # type: ignore[misc]
     if args.reference is not None:
         reference = map_reference(read_height_map(args.reference))
-        wanted.append(lambda p: measure_deviation(p, reference, level=args.level))
+        region = Region.of(args.region) if args.region else None
+        wanted.append(lambda p: measure_deviation(p, reference, region, args.level))
     return wanted
 
 
@@ -143,6 +163,26 @@ def _write_x3p(path: Path, points: Points) -> None:
     if points.ndim != 2:
         raise StackError("--x3p needs an organised cloud; expected cloud.pcd or height.tiff")
     save_x3p(path, make_height_map(points))
+
+
+def _draw(path: Path, points: Points, found: Measurement, title: str) -> None:
+    """Draw a section or a map of deviations; of other measurements there is nothing to draw."""
+    from sl_bringup.pictures import residual_picture, section_picture  # half a second
+
+    if isinstance(found, ProfileMeasurement):
+        ends = " to ".join(f"({1e3 * x:g}, {1e3 * y:g})" for x, y in (found.from_m, found.to_m))
+        png = section_picture([("mean of the strip", found)], f"{title}: section {ends} mm")
+    elif isinstance(found, DeviationMeasurement):
+        if points.ndim != 2:
+            raise StackError("a map needs an organised cloud; expected cloud.pcd or height.tiff")
+        off = points.copy()
+        off["z"] = found.deviation_m
+        height = make_height_map(off)
+        png = residual_picture(height, height.z_m, f"{title}: deviation from the reference")
+    else:
+        return
+    with written_atomically(path) as partial:
+        partial.write_bytes(png)
 
 
 def told(found: Measurement) -> tuple[float, str]:
@@ -196,6 +236,12 @@ def _details(found: Measurement) -> Iterator[str]:
     if centre is not None:
         both = zip(centre, getattr(found, "u_centre_m", centre), strict=True)
         yield f"{'  centre':<18}({', '.join(rounded(1e3 * c, 1e3 * u) for c, u in both)}) mm"
+    if isinstance(found, DeviationMeasurement):
+        peak, valley = (f"{1e6 * v:+.4g} µm" for v in (found.peak_m, found.valley_m))
+        yield (
+            f"{'  form':<18}{1e6 * found.form_rms_m:.4g} µm rms beyond the stated noise; single "
+            f"points {valley} to {peak}, noise and all"
+        )
     if isinstance(found, RoughnessMeasurement):
         for name, value in found.corrected.items():
             length = name in ("Sa", "Sq", "Sp", "Sv", "Sz")

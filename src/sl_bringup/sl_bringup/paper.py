@@ -22,8 +22,8 @@ from sl_bench.optics import Optics
 from sl_bench.reference import reference_rig
 from sl_bench.surfaces import make_surface
 from sl_bench.world import World
-from sl_bringup.paper_pictures import groove_picture, section_picture
-from sl_bringup.pictures import relief_picture
+from sl_bringup.paper_pictures import groove_picture
+from sl_bringup.pictures import relief_picture, section_picture
 from sl_bringup.progress import complain, say
 from sl_bringup.report import write_json
 from sl_projector.documents import written_atomically

@@ -9,8 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from sl_bringup.pictures import broken_at_gaps, png
-from sl_reconstruct.measure.profile import ProfileMeasurement
+from sl_bringup.pictures import png
 
 #: Part of a flank that is drawn enlarged, metres.
 DETAIL_M = (1.0e-3, 1.25e-3)
@@ -42,21 +41,4 @@ def groove_picture(clouds: Sequence[tuple[str, NDArray[Any]]]) -> bytes:
         detail.set(title=f"{name}: {np.count_nonzero(near)} points in 0.25 mm")
     for part in axes[-1]:
         part.set_xlabel("x / mm")
-    return png(figure)
-
-
-def section_picture(sections: Sequence[tuple[str, ProfileMeasurement]], title: str) -> bytes:
-    """Sections over each other, each with a band of two standard uncertainties."""
-    figure = Figure(figsize=(11, 2.6 * len(sections)), layout="constrained")
-    axes = figure.subplots(len(sections), 1, sharex=True, squeeze=False)[:, 0]
-    figure.suptitle(title)
-    for (name, s), part in zip(sections, axes, strict=True):
-        x_mm, z_um, u_um = broken_at_gaps(1e3 * s.along_m, 1e6 * s.z_m, 1e6 * s.u_z_m)
-        part.fill_between(x_mm, z_um - 2 * u_um, z_um + 2 * u_um, color="#56B4E9", alpha=0.6,
-                          linewidth=0, label="± 2 standard uncertainties")  # fmt: skip
-        part.plot(x_mm, z_um, color="#0072B2", linewidth=0.8, label=name)
-        part.set_ylabel("z / µm")
-        part.grid(True, alpha=0.3)
-        part.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    axes[-1].set_xlabel("along the section / mm")
     return png(figure)
