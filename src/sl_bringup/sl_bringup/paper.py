@@ -179,10 +179,10 @@ def table(rows: Sequence[Row], angles: Sequence[AngleMeasurement]) -> Iterator[s
     yield _line("standard deviation", [f"{PAPER['sd_um']} µm",
                 *(f"{1e6 * a.rms_m:.3f} µm" for a in angles)])  # fmt: skip
     yield _line(
-        "included angle", [f"{PAPER['angle']} deg", *(f"{a.value:.4f} deg" for a in angles)]
+        "included angle", [f"{PAPER['angle']} deg", *(f"{a.value:.5f} deg" for a in angles)]
     )
     yield _line("  off 155.92 by", ["3.43 deg",
-                *(f"{a.value - TRUE_ANGLE_DEG:+.4f} deg" for a in angles)])  # fmt: skip
+                *(f"{a.value - TRUE_ANGLE_DEG:+.5f} deg" for a in angles)])  # fmt: skip
     yield _line("  uncertainty", ["", *(f"{a.uncertainty:.5f} deg" for a in angles)])
     yield _line("area", ["12 x 9 mm", *("{:.1f} x {:.1f} mm".format(*r.area_mm) for r in rows)])
     yield _line("points", [f"{PAPER['points']:,}", *(f"{r.count:,}" for r in rows)])
