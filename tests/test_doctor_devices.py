@@ -92,6 +92,14 @@ def test_a_socket_that_is_not_served_is_told(rig: Rig) -> None:
     assert "slrig up --bench" in finding.remedy
 
 
+def test_what_the_configuration_leaves_out_is_another_drivers_or_not_there(rig: Rig) -> None:
+    rig.config.write_text("/sl/projector:\n  ros__parameters: {device: 'socket:/no/such/socket'}\n")
+    camera, stage = rig.find("camera"), rig.find("stage")
+    assert (camera.level, stage.level) == ("note", "note")
+    assert "camera/image_raw" in camera.text
+    assert "require_pose: false" in stage.remedy
+
+
 def test_a_stage_that_is_locked_or_mute_is_told(rig: Rig) -> None:
     rig.stage.power_cycle()
     finding = rig.find("stage")

@@ -15,7 +15,7 @@ import yaml
 
 from processes import wait_until_ended
 from sl_bringup.graph import is_running, lock_directory
-from sl_bringup.graph_config import NODES, Changes, find_config, write_config
+from sl_bringup.graph_config import NODES, Changes, find_config, started_nodes, write_config
 from sl_bringup.supervisor import Process, Supervisor, Timing
 from sl_projector.errors import ConfigError
 
@@ -224,3 +224,13 @@ def test_both_files_name_every_node(name: str) -> None:
     found = yaml.safe_load(find_config(name).read_text())
     nodes = {f"/sl/{name}" for name in NODES}
     assert nodes | ({"/sl/bench"} if name == "bench.yaml" else set()) == set(found)
+
+
+def test_a_camera_or_stage_without_a_section_is_not_started(tmp_path: Path) -> None:
+    source = tmp_path / "rig.yaml"
+    source.write_text("/sl/projector:\n  ros__parameters: {device: usb}\n")
+    others = ["projector", "synchronizer", "reconstruct", "calibration"]
+    assert list(started_nodes(source)) == others
+    source.write_text("/sl/stage:\n  ros__parameters: {kind: manual}\n")
+    assert sorted(started_nodes(source)) == sorted([*others, "stage"])
+    assert started_nodes(find_config("hardware.yaml")) == NODES

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import yaml
 
 from sl_bringup.graph import GraphOptions, client_command, client_environment
-from sl_bringup.graph_config import NODES, write_config
+from sl_bringup.graph_config import write_config
 from sl_bringup.transport import (
     MIB,
     SEGMENT_BYTES,
@@ -203,7 +203,7 @@ def graph(options: GraphOptions) -> list[Finding]:
     """A running graph and what its nodes say."""
     if not _there("rclpy"):
         return []
-    wanted = ("--nodes", *NODES, "--timeout", "4", "--states")
+    wanted = ("--nodes", *options.nodes, "--timeout", "4", "--states")
     command = client_command("sl_bringup.ready_node", options, *wanted)
     asked: Any = subprocess.run(
         command, env=client_environment(options), capture_output=True, text=True, check=False
@@ -212,7 +212,7 @@ def graph(options: GraphOptions) -> list[Finding]:
     if asked.returncode == 0:
         return [Finding("ok", "graph", f"running and ready in domain {options.domain}"), *states]
     complaint = asked.stderr.strip().removeprefix("graph not ready: ")
-    if all(f"{name} is silent" in complaint for name in NODES):
+    if all(f"{name} is silent" in complaint for name in options.nodes):
         remedy = "slrig up" + (" --bench" if options.bench else "")
         remedy += f" --config {options.config}" if options.config else ""
         return [Finding("note", "graph", f"none runs in domain {options.domain}", remedy)]

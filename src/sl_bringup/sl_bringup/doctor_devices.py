@@ -15,6 +15,7 @@ import yaml
 
 import sl_projector
 from sl_bringup.doctor_checks import Finding, find_usb, serial_ports
+from sl_bringup.graph_config import NODES, started_nodes
 from sl_camera.aravis_library import INSTALL as ARAVIS_INSTALL
 from sl_camera.aravis_library import find_camera, list_cameras, load_aravis
 from sl_camera.camera_drivers import make_camera
@@ -40,6 +41,17 @@ RULES = Path(sl_projector.__file__).parents[1] / "udev" / "60-sl-projector.rules
 RELOAD = (
     "sudo udevadm control --reload && sudo udevadm trigger, then unplug it and plug it in again"
 )
+#: What is said of devices that the configuration has no section for.
+LEFT_OUT = {
+    "camera": Finding(
+        "note", "camera", "no section /sl/camera: another driver is to publish camera/image_raw",
+        "remap that driver's images (docs/cameras.md)",
+    ),
+    "stage": Finding(
+        "note", "stage", "no section /sl/stage: a rig without a stage",
+        "say require_pose: false in the section /sl/synchronizer",
+    ),
+}  # fmt: skip
 #: Longest wait for a stage's answer; grblHAL may need a second.
 STAGE_TIMEOUT_S = 2.0
 
@@ -52,7 +64,12 @@ def devices(source: Path, running: bool) -> list[Finding]:
         return dict(sections.get(f"/sl/{node}", {}).get("ros__parameters", {}))
 
     looks = ((projector, "projector"), (stage, "stage"), (camera, "camera"))
-    return [finding for look, node in looks for finding in look(of(node), running)]
+    left_out = set(NODES) - set(started_nodes(source))
+    return [
+        finding
+        for look, node in looks
+        for finding in ([LEFT_OUT[node]] if node in left_out else look(of(node), running))
+    ]
 
 
 # -- permissions and owners -----------------------------------------------------------------

@@ -14,11 +14,11 @@ from types import TracebackType
 from typing import IO, NoReturn
 
 from sl_bringup.graph_config import (
-    NODES,
     TRUE_RIG,
     Changes,
     find_config,
     runtime_directory,
+    started_nodes,
     write_config,
 )
 from sl_bringup.supervisor import Process, Supervisor
@@ -54,6 +54,11 @@ class GraphOptions:
     def source(self) -> Path:
         """The configuration file in use."""
         return self.config or find_config("bench.yaml" if self.bench else "hardware.yaml")
+
+    @property
+    def nodes(self) -> dict[str, str]:
+        """Nodes of the graph and their modules."""
+        return started_nodes(self.source)
 
     @property
     def directory(self) -> Path:
@@ -117,7 +122,7 @@ class Graph:
             config = self._write_config()
             if self._options.bench:
                 self._start_bench(config)
-            for name, module in NODES.items():
+            for name, module in self._options.nodes.items():
                 self._start_node(name, module, config)
         except BaseException:
             await self._stop()
@@ -140,7 +145,7 @@ class Graph:
         timeout_s : float
             Give up after so long; 0: never.
         """
-        wanted = ("--nodes", *NODES, "--timeout", f"{timeout_s}")
+        wanted = ("--nodes", *self._options.nodes, "--timeout", f"{timeout_s}")
         if await self.run_client("sl_bringup.ready_node", *wanted) != 0:
             return False
         if self._options.bench:

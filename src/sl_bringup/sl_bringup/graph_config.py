@@ -29,6 +29,8 @@ NODES = {
     "reconstruct": "sl_reconstruct.reconstruct_node",
     "calibration": "sl_calibration.calibration_node",
 }
+#: What a rig may do without: without a section of its own in the file it is not started.
+OPTIONAL = ("camera", "stage")
 #: Sections that may name a calibration file; the graph's is the calibration node's.
 CALIBRATED = ("/sl/calibration", "/sl/reconstruct")
 RUNTIME_VARIABLE = "$(var runtime_dir)"
@@ -86,6 +88,22 @@ def runtime_directory(domain: int) -> Path:
     directory = base / f"slrig-{os.getuid()}" / f"domain-{domain}"
     directory.mkdir(parents=True, exist_ok=True, mode=0o700)
     return directory
+
+
+def started_nodes(source: Path) -> dict[str, str]:
+    """Return the nodes that a configuration starts and their modules, in the order of the light.
+
+    Images may come from another program's camera driver, and a part may lie still without a stage.
+
+    Raises
+    ------
+    ConfigError
+        When the file is not a parameter file.
+    """
+    text = read_text(source, ConfigError)
+    document = _checked(parse_document(text, str(source), ConfigError), source)
+    there = {key.removeprefix(NAMESPACE + "/") for key in document}
+    return {name: m for name, m in NODES.items() if name not in OPTIONAL or name in there}
 
 
 def write_config(source: Path, directory: Path, changes: Changes) -> Path:

@@ -64,7 +64,8 @@ class ReadyNode(Node):  # type: ignore[misc]  # rclpy carries no types
             found.append("the calibration in force has not reached every node yet")
         offered = {name for name, _ in self.get_service_names_and_types()}
         prefix = self.get_namespace().rstrip("/")
-        return found + [f"no service {s}" for s in SERVICES if f"{prefix}/{s}" not in offered]
+        wanted = [s for s in SERVICES if "stage" in self._nodes or not s.startswith("stage/")]
+        return found + [f"no service {s}" for s in wanted if f"{prefix}/{s}" not in offered]
 
     def states(self) -> list[str]:
         """Each node's name, level and last word, "NAME | ok | ready"."""
