@@ -172,6 +172,20 @@ def test_a_deep_hole_is_found_by_where_points_end() -> None:
     np.testing.assert_allclose(m.centre_m, centre, atol=4e-6)
 
 
+@pytest.mark.parametrize("dark", [0.02, 0.5])
+def test_parts_of_several_holes_are_no_hole(dark: float) -> None:
+    """A region between four holes: their sides towards it, with points in them and without."""
+    points = cloud(lambda x, y: 0.0 * x, (150, 150), (0.9e-3, 0.9e-3), sigma_m=1e-7)
+    corners = [(x, y) for x in (-0.45e-3, 0.45e-3) for y in (-0.45e-3, 0.45e-3)]
+    from_edge = np.min(
+        [np.hypot(points["x"] - x, points["y"] - y) - 0.225e-3 for x, y in corners], axis=0
+    )
+    points["intensity"] *= dark + (1.0 - dark) / (1.0 + np.exp(-from_edge / 6e-6))
+    points["z"][points["intensity"] < 40.0] = np.nan
+    with pytest.raises(StackError, match="one hole"):
+        measure_hole(points)
+
+
 def test_a_deviation_map_shows_what_differs() -> None:
     """A bump of 5 um beside a reference from file, tilt of the mounting taken out."""
     nodes = np.linspace(-2.5e-3, 2.5e-3, 51)

@@ -75,15 +75,19 @@ def measure_hole(points: NDArray[Any], region: Region | None = None) -> HoleMeas
     light = _light(cut)
     edges, blur = crossings(cut, light)
     method: Method = "intensity"
+    spacing = typical_spacing_m(cut)
     strip, u_edge = 0.0, U_EDGE_LEVEL * blur
     values, used, fit = _round(edges, region)
-    if not _within(values, edges):
+    if not _is_hole(values, edges, fit, spacing):
         edges, method = _ends(cut), "presence"
-        strip = REFUSED_SPACINGS * typical_spacing_m(cut)
+        strip = REFUSED_SPACINGS * spacing
         u_edge = strip / 12**0.5
         values, used, fit = _round(edges, region)
-    if fit is None:
-        raise StackError(f"{len(edges)} edges in the region; expected a hole with plate around it")
+    if fit is None or not _is_hole(values, edges, fit, REFUSED_SPACINGS * spacing):
+        told = "" if fit is None else f", {1e6 * fit.rms_m:.3g} µm rms off a circle"
+        raise StackError(
+            f"{len(edges)} edges in the region{told}; expected one hole with plate around it"
+        )
     u = np.sqrt(np.diag(fit.covariance))
     # The strip's width lies somewhere between 0 and `strip`: its middle, and that of a rectangle.
     return HoleMeasurement(
@@ -160,9 +164,11 @@ def _round(edges: Array, region: Region | None) -> tuple[Array, NDArray[np.bool_
     return values, used, uncertainties(jacobian, residual, flat.sigma_m[used], edges[used])
 
 
-def _within(values: Array, edges: Array) -> bool:
-    """Whether a circle's centre lies among its edges, so that they tell a diameter."""
-    if not np.isfinite(values).all():
+def _is_hole(values: Array, edges: Array, fit: Fitted | None, scatter_m: float) -> bool:
+    """Whether edges scatter little enough, and a circle's centre lies among them: parts of several
+    holes do not make one.
+    """
+    if fit is None or not np.isfinite(values).all() or fit.rms_m > scatter_m:
         return False
     low, high = edges.min(axis=0), edges.max(axis=0)
     return bool(((values[:2] > low) & (values[:2] < high)).all())
