@@ -147,6 +147,24 @@ def test_image_data_asks_for_no_reply(bench):
     assert flags[0x1A34] == flags[0x1A2A] == 0x40
 
 
+def test_the_status_thread_does_not_come_between_image_data_and_its_error(bench):
+    bench.recorder.reports.clear()
+    over = threading.Event()
+
+    def ask():
+        while not over.is_set():
+            bench.driver.status()
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    bench.driver.load(named("precise"), FAST)
+    over.set()
+    thread.join()
+    commands = [command for _, command, _ in bench.recorder.messages()]
+    after = {commands[i + 1] for i, command in enumerate(commands) if command == 0x1A2B}
+    assert after == {0x0100}
+
+
 def test_precise_is_uploaded_in_150_messages(bench):
     bench.recorder.reports.clear()
     info = bench.driver.load(named("precise"), FAST)

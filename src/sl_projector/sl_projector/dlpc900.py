@@ -390,10 +390,9 @@ class Dlpc900:
             for controller, stream in enumerate(images[number]):
                 init = protocol.image_init(number, len(stream))
                 port.write(protocol.IMAGE_INIT[controller], init)
+                step = f"loading image {number} to controller {controller}"
                 for chunk in protocol.image_chunks(stream):
-                    port.send(protocol.IMAGE_DATA[controller], chunk)
-                    # Asked each time: the next command without an error would hide this one's.
-                    port.check(f"loading image {number} to controller {controller}")
+                    port.send(protocol.IMAGE_DATA[controller], chunk, step)
 
     # -- running -------------------------------------------------------------------------------
 

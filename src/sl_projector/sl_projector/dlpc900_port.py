@@ -111,25 +111,26 @@ class Dlpc900Port:
             self._refuse(command, reply)
         return times
 
-    def send(self, command: int, data: bytes) -> None:
-        """Send data without asking for a reply (image data must be sent so)."""
-        with self._lock:
-            self._send(command, data, read=False, reply=False)
+    def send(self, command: int, data: bytes, step: str) -> None:
+        """Send data without asking for a reply (image data must be sent so), then for its error.
 
-    def check(self, step: str) -> None:
-        """Read the error code after a step whose commands had no reply.
+        Nothing comes between the two, also not of another thread: the next command without an
+        error would hide this one's.
 
         Raises
         ------
         DeviceRefused
             When the device has an error latched; names the step.
         """
-        code = self.read(protocol.ERROR_CODE)[0]
-        if code:
-            raise DeviceRefused(
-                f"DLPC900 reports error {code}, "
-                f"{protocol.ERRORS.get(code, 'undefined error')}{self._error_text()}, after {step}"
-            )
+        with self._lock:
+            self._send(command, data, read=False, reply=False)
+            code = self.read(protocol.ERROR_CODE)[0]
+            if code:
+                raise DeviceRefused(
+                    f"{self.chip} reports error {code}, "
+                    f"{protocol.ERRORS.get(code, 'undefined error')}{self._error_text()}, "
+                    f"after {step}"
+                )
 
     def _twice(self, exchange: Callable[[], protocol.Reply]) -> protocol.Reply:
         try:
