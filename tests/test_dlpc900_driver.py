@@ -350,6 +350,10 @@ def test_status_complains_of_a_missing_secondary_controller():
     # A DMD of two controllers whose second does not answer.
     bench.emulator.model = dataclasses.replace(bench.emulator.model, dual=False)
     assert bench.driver.status().problems == ("secondary controller missing",)
+    with pytest.raises(
+        DeviceError, match="after loading the sequence: secondary controller missing"
+    ):
+        bench.driver.load(named("paper", (2560, 1600)), FAST)
     bench.driver.close()
 
 

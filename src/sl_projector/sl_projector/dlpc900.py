@@ -45,6 +45,9 @@ _WAIT_MARGIN_S = 3.0
 # How much sooner than computed a run may end: host and device clocks, and the start's latency.
 _EARLY_S, _EARLY_RELATIVE = 0.005, 1e-3
 _IDLE_OFF_VALUES = (0, 3)  # older and newer firmware
+_STATES = (
+    protocol.HARDWARE_STATUS, protocol.SYSTEM_STATUS, protocol.MAIN_STATUS, protocol.POWER,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -244,17 +247,13 @@ class Dlpc900:
         return self._port
 
     def _check_hardware(self, port: Dlpc900Port, step: str) -> None:
-        problems = protocol.hardware_problems(port.read(protocol.HARDWARE_STATUS)[0])
-        if problems:
+        if problems := self._problems({name: port.read(name)[0] for name in _STATES}):
             raise DeviceError(f"{port.chip} after {step}: {', '.join(problems)}")
 
     def status(self) -> ProjectorStatus:
         """See `ProjectorDriver`."""
         port = self._opened()
-        names = (
-            protocol.ERROR_CODE, protocol.HARDWARE_STATUS, protocol.SYSTEM_STATUS,
-            protocol.MAIN_STATUS, protocol.POWER, protocol.IDLE,
-        )  # fmt: skip
+        names = (protocol.ERROR_CODE, *_STATES, protocol.IDLE)
         value = {name: port.read(name)[0] for name in names}
         tag = port.read(protocol.HARDWARE)[1:].split(b"\0")[0].decode("ascii", "replace")
         version = protocol.firmware_version(port.read(protocol.VERSION, 4))
