@@ -9,18 +9,11 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from collections.abc import Iterator
 
-from sl_camera.grbl_conversation import POLL_S, GrblConversation, Triple
-from sl_camera.grbl_protocol import (
-    HOLD,
-    JOG_CANCEL,
-    RESUME,
-    MachineFrame,
-    Report,
-    machine_frame,
-)
+from sl_camera.grbl_conversation import GrblConversation, Triple
+from sl_camera.grbl_protocol import HOLD, RESUME, MachineFrame, Report, machine_frame
+from sl_camera.grbl_rest import halt, verify, wait_begin, wait_idle
 from sl_camera.stage import Position, StageLimits, StageState
 from sl_projector.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
 
@@ -76,7 +69,7 @@ class GrblStage:
         try:
             first = talk.greet()
             if first is not None and first.state in ("Run", "Jog", "Hold", "Door"):
-                self._halt(talk)
+                halt(talk)
             talk.know_banner()
             talk.exchange("$$", self._reply_timeout_s)
             missing = [n for n in NEEDED_SETTINGS if n not in talk.settings]
@@ -192,7 +185,7 @@ class GrblStage:
             yield self._open_talk()
         except DeviceTimeout:
             with contextlib.suppress(DeviceError):
-                self.stop()
+                self._stop()
             raise
         finally:
             self._activity = ""
@@ -204,7 +197,7 @@ class GrblStage:
         """``$H``; blocks until the switches are found."""
         with self._owning_motion("homing", "idle", "not_homed") as talk:
             talk.exchange("$H", timeout_s, poll_s=HOMING_POLL_S)
-            talk.wait_state(lambda report: report.state == "Idle", "idle after homing")
+            wait_idle(talk, "idle after homing")
             talk.referenced = True
 
     def move_to(
@@ -219,14 +212,15 @@ class GrblStage:
         target_mm = frame.machine_mm((x_m, y_m, z_m))
         with self._owning_motion("moving", "idle") as talk:
             talk.exchange(self._move_line(target_mm), self._reply_timeout_s)
+            breaks = talk.breaks
             talk.exchange("G4P0.01", timeout_s, may_be_lost=True)
             talk.wait_state(lambda report: report.state == "Idle", "idle")
-            _verify(talk, target_mm)
+            verify(talk, target_mm, breaks)
 
     def _move_line(self, target_mm: Triple) -> str:
         x, y, z = target_mm
-        rate = "G0" if self._speed_m_s is None else f"G1F{self._speed_m_s * 6e4:.1f}"
-        return f"G21G90G94G53{rate}X{x:.4f}Y{y:.4f}Z{z:.4f}"
+        rate = "G0" if self._speed_m_s is None else f"G1 F{self._speed_m_s * 6e4:.1f}"
+        return f"G21 G90 G94 G53 {rate} X{x:.4f} Y{y:.4f} Z{z:.4f}"
 
     def jog_by(self, dx_m: float, dy_m: float, dz_m: float, *, speed_m_s: float) -> None:
         """Start a relative motion and return; ``stop()`` ends it at any time.
@@ -242,25 +236,16 @@ class GrblStage:
         with self._owning_motion("moving", "idle") as talk:
             x, y, z = (a + b for a, b in zip(self.position_m(), (dx_m, dy_m, dz_m), strict=True))
             frame.limits().require_inside((x, y, z))
-            x, y, z = frame.machine_mm((x, y, z))
-            line = f"$J=G21G90G53X{x:.4f}Y{y:.4f}Z{z:.4f}F{speed_m_s * 6e4:.1f}"
+            x, y, z = (1e3 * s * d for s, d in zip(self._signs, (dx_m, dy_m, dz_m), strict=True))
+            # relative, as in GRBL's own examples: there are controllers that jog no other way
+            line = f"$J=G91 G21 X{x:.4f} Y{y:.4f} Z{z:.4f} F{speed_m_s * 6e4:.1f}"
             talk.exchange(line, self._reply_timeout_s)
-            talk.expire_report()
+            wait_begin(talk)
 
     def hold(self) -> None:
         """``!``: halt smoothly; ``resume`` goes on. Refused while homing and in alarm."""
         self._require("idle", "moving", "hold")
-        self._halt(self._open_talk())
-
-    @staticmethod
-    def _halt(talk: GrblConversation) -> None:
-        """Bring motion to rest: a jog is cancelled, anything else is held."""
-        jogging = talk.state_word == "Jog"
-        talk.write(JOG_CANCEL if jogging else HOLD)
-        resting = ("Idle",) if jogging else ("Hold", "Door")
-        talk.wait_state(
-            lambda report: report.state in resting and (jogging or report.substate == 0), "halted"
-        )
+        halt(self._open_talk())
 
     def resume(self) -> None:
         """``~``: go on with what ``hold`` interrupted."""
@@ -270,7 +255,20 @@ class GrblStage:
         talk.wait_state(lambda report: report.state not in ("Hold", "Door"), "resumed")
 
     def stop(self) -> None:
-        """Halt and drop what is left: jog cancel, or hold and a reset while standing."""
+        """Halt and drop what is left: jog cancel, or hold and a reset while standing.
+
+        A controller that takes no notice of either is reset in motion: that costs the position.
+
+        Raises
+        ------
+        DeviceError
+            It took a reset, or an alarm came instead; nothing moves until ``clear``.
+        """
+        self._stop()
+        if self._motion_lock.acquire(timeout=self._reply_timeout_s):  # the mover has noticed
+            self._motion_lock.release()
+
+    def _stop(self) -> None:
         talk = self._open_talk()
         if self._activity == "homing":
             talk.reset()
@@ -280,7 +278,15 @@ class GrblStage:
         report = talk.report(fresh=True)
         if report.state == "Alarm" or (report.state == "Idle" and not self._activity):
             return
-        self._halt(talk)
+        try:
+            halt(talk)
+        except DeviceLost:
+            raise
+        except DeviceError as error:
+            if talk.alarm is None:
+                talk.reset()
+                talk.lose_position(f"stopped by a reset, the position is lost: {error}")
+            raise DeviceError(talk.alarm) from error
         if talk.report(fresh=True).state != "Idle" or self._activity:
             talk.reset()
             talk.report(fresh=True)
@@ -291,32 +297,11 @@ class GrblStage:
         if self.state().kind not in ("alarm", "not_homed"):
             return
         talk.reset()
+        if talk.alarm is None and talk.state_word != "Check":
+            talk.referenced = False  # locked for a reason that was not told, or asleep
         if talk.report(fresh=True).state == "Alarm":
             talk.exchange("$X", self._reply_timeout_s)
         report = talk.report(fresh=True)
         if report.state != "Idle":
             raise DeviceRefused(f"still {report.state} after the unlock: {talk.message}")
         talk.alarm = None
-
-
-def _verify(talk: GrblConversation, target_mm: Triple) -> None:
-    """The controller must stand where it was sent; there are some that are idle too early."""
-    while not _is_at(talk, target_mm):
-        before_mm = talk.machine_mm
-        time.sleep(POLL_S)
-        talk.report(fresh=True)
-        if talk.machine_mm == before_mm:
-            talk.distrust()  # its planner counts from elsewhere than its position
-            raise DeviceError(
-                f"the stage says that it has moved but stands at MPos {talk.machine_mm} mm, "
-                f"expected {tuple(round(value, 4) for value in target_mm)}"
-            )
-
-
-def _is_at(talk: GrblConversation, target_mm: Triple) -> bool:
-    """To a step and the report's rounding."""
-    found = zip(talk.machine_mm or target_mm, target_mm, strict=True)
-    return all(
-        abs(value - wanted) <= 0.002 + 1.0 / (talk.settings.get(100 + i) or 1000.0)
-        for i, (value, wanted) in enumerate(found)
-    )

@@ -17,6 +17,7 @@ from sl_camera.grbl_protocol import (
     ECHO,
     RESET,
     STATUS,
+    UNTOLD_ALARM,
     Report,
     alarm_code,
     alarm_text,
@@ -31,7 +32,7 @@ from sl_projector.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTi
 POLL_S = 0.1  # GRBL asks for at most 10 status requests a second
 NUDGE_S = 0.25
 STILL_S = 5.0  # without a time-out a wait ends after standing still for so long
-RESET_ATTEMPTS = 4
+RESET_ATTEMPTS = 8
 REPORTS_TO_OFFSET = 31
 IDLE_WITHOUT_REPLY_S = 1.0  # idle for so long with the answer to a dwell owing: it is lost
 MAX_LINE = 79  # characters, of GRBL's 80 with the line end
@@ -122,10 +123,11 @@ class GrblConversation:
         self._report: Report | None = None
         self._report_time = -math.inf
         self._asked_ns = 0  # of the oldest question for the status that has no answer yet
-        self.measured_ns = 0
+        self._last_asked_ns = self.measured_ns = 0
         self._offset_mm: Triple | None = None
         self._reports = self._banners = 0
         self._banner_wanted = True
+        self._late_banners_until = -math.inf  # of resets that were repeated: no surprise either
         self._break = 0  # counts alarms and resets: whoever waits for an answer stops waiting
         self._resync = False
         self._link = SerialLines(port, baud, self._on_line, self._on_lost)
@@ -171,8 +173,11 @@ class GrblConversation:
             self.noise_lines += 1
             return
         self._offset_mm = report.offset or self._offset_mm
+        if report.state == "Alarm" and self.state_word not in ("Alarm", "") and not self.alarm:
+            self.lose_position(UNTOLD_ALARM)
+            self._break += 1
         self._report, self._report_time = report, time.monotonic()
-        self.measured_ns, self._asked_ns = self._asked_ns or time.time_ns(), 0
+        self.measured_ns, self._asked_ns = self._asked_ns or self._last_asked_ns, 0
         self._reports += 1
         offset = (0.0, 0.0, 0.0) if report.is_machine else self._offset_mm
         if offset is not None:
@@ -187,13 +192,19 @@ class GrblConversation:
         self._break += 1
 
     def _on_banner(self, line: str) -> None:
-        self.version, self.is_deaf = line, False
+        self.version, self.is_deaf, self._asked_ns = line, False, 0
+        self._report = None  # of before
         self._banners += 1
         self._replies.clear()
-        if not self._banner_wanted and self.alarm is None:
-            self.alarm = "the controller restarted by itself (power cycle?); the position is lost"
-            self.referenced = False
+        if not self._banner_wanted and time.monotonic() > self._late_banners_until:
+            self.lose_position(
+                "the controller restarted by itself (power cycle?); the position is lost"
+            )
         self._break += 1
+
+    def lose_position(self, reason: str) -> None:
+        """Nothing may move before this is acknowledged; an alarm that is known goes before it."""
+        self.alarm, self.referenced = self.alarm or reason, False
 
     # -- talking ------------------------------------------------------------------------------
 
@@ -201,9 +212,18 @@ class GrblConversation:
         """Send bytes, real-time commands among them; DeviceLost where there is no port."""
         if self.lost is not None:
             raise DeviceLost(f"stage on {self.port}: {self.lost}")
-        if data == STATUS and not self._asked_ns:
-            self._asked_ns = time.time_ns()
+        if data == STATUS:
+            self._last_asked_ns = time.time_ns()
+            self._asked_ns = self._asked_ns or self._last_asked_ns
         self._link.write(data)
+
+    def _ask_in_turn(self) -> None:
+        """Ask for the status, unless somebody waits for an answer already.
+
+        GRBL may answer two questions with one report, and then nobody knows of when it is.
+        """
+        if not self._asked_ns or time.time_ns() - self._last_asked_ns > NUDGE_S * 1e9:
+            self.write(STATUS)
 
     def _wait(self, done: Callable[[], bool], timeout_s: float) -> bool:
         """Wait until ``done``; raises where the port vanishes meanwhile."""
@@ -309,6 +329,8 @@ class GrblConversation:
             self.write(line.encode("ascii") + b"\n")
             reply = self._await_reply(line, started, Patience(timeout_s), poll_s, may_be_lost)
         if reply != "ok":
+            if line.startswith("$J"):
+                self._resync = True  # grblHAL would refuse all moves after a jog that it refused
             raise DeviceRefused(f"GRBL refuses {line!r}: {error_text(reply)}")
 
     def _await_reply(
@@ -322,11 +344,9 @@ class GrblConversation:
             if patience.is_over:
                 self._resync = True
                 raise DeviceTimeout(f"no answer to {line!r} {patience.text}")
-            self.write(STATUS)
+            self._ask_in_turn()
         with self._cv:
-            if self._break != started:
-                reason = self.alarm or f"the controller was stopped before {line!r} was done"
-                raise DeviceError(reason)
+            self.require_unbroken(started, f"{line!r} was done")
             return self._replies[0]
 
     @property
@@ -353,13 +373,19 @@ class GrblConversation:
             for attempt in range(RESET_ATTEMPTS):
                 self.write(RESET)
                 if self._asking(lambda: self._banners > seen, self.reply_timeout_s / 3):
-                    time.sleep(0.3 * attempt)  # the banner of the attempt before may still come
+                    self._await_late_banners(seen, attempt)
                     break
             else:
                 raise DeviceTimeout(f"no GRBL banner from {self.port} after a reset")
         finally:
             self._banner_wanted = False
         self._resync = False
+
+    def _await_late_banners(self, seen: int, repeats: int) -> None:
+        """Each reset may have been heard: a banner that is still to come is no power cycle."""
+        if repeats:
+            self._asking(lambda: self._banners > seen + repeats, 0.3 * repeats)
+            self._late_banners_until = time.monotonic() + self.reply_timeout_s
 
     def report(self, *, fresh: bool = False) -> Report:
         """Latest status report, asked for where the last is older than the polling interval.
@@ -373,6 +399,7 @@ class GrblConversation:
             report = self._report
             if report is not None and not fresh and time.monotonic() - self._report_time < POLL_S:
                 return report
+            self._wait(lambda: not self._asked_ns, NUDGE_S)
             seen = self._reports
             self.write(STATUS)
             answered = self._asking(lambda: self._reports > seen, self.reply_timeout_s)
@@ -387,6 +414,16 @@ class GrblConversation:
     def expire_report(self) -> None:
         """The report at hand is from before a command: the next caller gets a new one."""
         self._report_time = -math.inf
+
+    @property
+    def breaks(self) -> int:
+        """How many alarms and resets there have been."""
+        return self._break
+
+    def require_unbroken(self, breaks: int, what: str) -> None:
+        """DeviceError where there was an alarm or a reset since ``breaks`` was read."""
+        if self._break != breaks:
+            raise DeviceError(self.alarm or f"the controller was stopped before {what}")
 
     def wait_state(self, wanted: Callable[[Report], bool], what: str) -> None:
         """Ask for the status until it is as wanted.
@@ -403,6 +440,6 @@ class GrblConversation:
             patience.spend("", self.machine_mm)
             if patience.is_over:
                 raise DeviceTimeout(f"stage not {what} {patience.text}, state {report.state}")
-            if self.alarm is not None:
-                raise DeviceError(self.alarm)
+            if self.alarm is not None or report.state == "Alarm":
+                raise DeviceError(self.alarm or UNTOLD_ALARM)
             time.sleep(POLL_S)

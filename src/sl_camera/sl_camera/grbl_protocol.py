@@ -81,6 +81,7 @@ ALARMS = {
     17: "motor fault (grblHAL)",
 }
 
+UNTOLD_ALARM = "the controller is in alarm and did not say why"
 ALARMS_KEEPING_POSITION = frozenset({2, 4, 5})
 
 
@@ -128,6 +129,18 @@ class Report:
     position: tuple[float, float, float]
     is_machine: bool
     offset: tuple[float, float, float] | None
+
+    @property
+    def is_halted(self) -> bool:
+        """A hold or an open door whose motion is over (not ``Hold:1``, ``Door:2``, ``Door:3``)."""
+        return (self.state == "Hold" and self.substate == 0) or (
+            self.state == "Door" and self.substate < 2
+        )
+
+    @property
+    def is_braking(self) -> bool:
+        """On its way to being halted."""
+        return self.state in ("Hold", "Door") and not self.is_halted
 
 
 def parse_report(line: str) -> Report:
@@ -227,18 +240,18 @@ def machine_frame(
     """Frame and reach from the controller's own settings.
 
     With homing (``$22``) machine space is [-travel, 0] (``$130`` to ``$132``) and the stage's
-    zero is by default its middle. Without homing, machine zero is where the stage stood at
-    power-up: that is the stage's zero then, and the travel bounds it on both sides.
+    zero is by default its middle. grblHAL can call the switch zero (bit 3 of ``$22``): then an
+    axis homed in the negative direction (``$23``) has [0, travel]. Without homing, machine zero
+    is where the stage stood at power-up: that is the stage's zero then, and the travel bounds it
+    on both sides.
     """
-    travel = tuple(abs(settings.get(130 + i, 0.0)) for i in range(len(AXES)))
-    homing = int(settings.get(22, 0)) & 1
-    top = tuple(0.0 if homing else length for length in travel)
-    middle = tuple(
-        (high - length) / 2 if homing else 0.0 for high, length in zip(top, travel, strict=True)
-    )
+    travel = [abs(settings.get(130 + i, 0.0)) for i in range(len(AXES))]
+    homing, directions = int(settings.get(22, 0)), int(settings.get(23, 0))
+    low, high = [-length for length in travel], list(travel)
+    for i in range(len(AXES)) if homing & 1 else ():
+        positive = homing & 8 and directions >> i & 1
+        low[i], high[i] = (0.0, travel[i]) if positive else (-travel[i], 0.0)
+    x, y, z = ((a + b) / 2.0 for a, b in zip(low, high, strict=True))
     return MachineFrame(
-        origin_mm or (middle[0], middle[1], middle[2]),
-        signs,
-        (-travel[0], -travel[1], -travel[2]),
-        (top[0], top[1], top[2]),
+        origin_mm or (x, y, z), signs, (low[0], low[1], low[2]), (high[0], high[1], high[2])
     )
