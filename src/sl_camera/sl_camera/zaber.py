@@ -26,6 +26,7 @@ from sl_projector.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTi
 
 POLL_S = 0.05
 NO_REFERENCE = "position counts from where it was switched on"
+ABSENT = Reply(0, 0, None, accepted=True, busy=False, flag="--", data="0")
 STILL_S = 5.0  # a move without a time-out is given up after standing still for so long
 
 
@@ -36,7 +37,7 @@ class ZaberAxis:
     Parameters
     ----------
     device : int
-        Address in the daisy chain, 1 to 99.
+        Address in the daisy chain, 1 to 99; 0: the stage has no such axis, it stands at zero.
     axis : int
         Axis of the device, from 1.
     microstep_m : float
@@ -161,6 +162,8 @@ class ZaberStage:
 
         Every command used here may be sent twice with the same effect.
         """
+        if not axis.device:
+            return ABSENT
         with self._line_lock:
             for _ in range(2):
                 reply = self._exchange(axis, data)
