@@ -274,6 +274,13 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, content: bytes, suffix: str) 
         pass
 
 
+def test_a_file_of_something_else_is_not_called_unfinished(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"no recording at all " * 20)
+    with pytest.raises(BagError, match="magic") as refused, open_bag(tmp_path / "a.mcap"):
+        pass
+    assert "not ended" not in str(refused.value)
+
+
 def test_no_bag_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BagError, match="there is no bag"), open_bag(tmp_path / "none"):
         pass

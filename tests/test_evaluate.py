@@ -290,8 +290,11 @@ def test_a_bag_without_scans_says_what_it_has(
 ) -> None:
     with new_bag(tmp_path / "bag") as bag:
         bag.pose((0.0, 0.0, 0.0), START_NS)
+    (tmp_path / "out").mkdir()
     assert evaluate(tmp_path / "bag", tmp_path / "out") == (1, [])
-    assert "no triggers on /sl/projector/trigger" in capsys.readouterr().err
+    told = capsys.readouterr()
+    assert "no triggers on /sl/projector/trigger" in told.err
+    assert "results in" not in told.out  # the folder is not of this evaluation
 
 
 def test_a_cut_recording_is_not_called_good(

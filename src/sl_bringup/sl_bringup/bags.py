@@ -336,7 +336,7 @@ def _open_files(bag: Bag, stack: ExitStack) -> None:
         bag._files += opened(bag, bag.path, stack)
     except Exception as exc:
         _refuse_formats(exc, bag.path)
-        harmless, why = _why_not_as_told(exc)
+        harmless, why = _why_not_as_told(exc) if bag.path.is_dir() else (False, _reason(exc))
         (bag.notes.append if harmless else bag.lose)(f"{bag.path.name}: {why}")
         for path in _storage_files(bag.path):
             bag._files += _open_damaged(bag, path, stack)

@@ -151,7 +151,7 @@ def run(args: argparse.Namespace) -> int:
     faults = list(_tell(args, results))
     for fault in faults:
         complain(f"slrig: {fault}")
-    if args.output.exists():
+    if any(isinstance(outcome, Result) for _, outcomes in results for _, outcome in outcomes):
         say(f"results in {args.output}")
     return 1 if faults else 0
 
