@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import tempfile
 from pathlib import Path
@@ -14,14 +15,27 @@ from sl_bringup.transport import Transport
 ROOT = Path(__file__).resolve().parents[1]
 
 
+#: Kinds of devices that have contract tests.
+HARDWARE = ("dlpc900", "camera", "grbl", "zaber")
+
+
+def hardware(text: str) -> str:
+    """Check KIND=ADDRESS: another kind would be passed over by every test."""
+    kind, _, address = text.partition("=")
+    if kind not in HARDWARE or not address:
+        raise argparse.ArgumentTypeError(f"{text}; expected KIND one of {HARDWARE}")
+    return text
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--hardware",
         action="append",
         default=[],
+        type=hardware,
         metavar="KIND=ADDRESS",
         help="run the contract tests on a real device too, e.g. --hardware grbl=/dev/ttyUSB0; "
-        "it will move",
+        f"it will move. KIND: {', '.join(HARDWARE)}",
     )
 
 
