@@ -188,6 +188,8 @@ def test_live_hashes_prove_or_disprove(
     assert [s["live"]["agrees"] for s in scans] == [True, False, None, None]
     assert "other settings" in scans[2]["live"]["told"]
     assert "1 DIFFER" in capsys.readouterr().out
+    index = (tmp_path / "1" / "index.html").read_text()
+    assert index.count(">Good<") == 3 and index.count("but the live cloud differs") == 1
 
 
 def test_the_recorded_settings_hold_unless_changed(

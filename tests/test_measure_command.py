@@ -83,10 +83,20 @@ def test_measure_tells_value_uncertainty_and_verdict(groove, tmp_path, capsys) -
     assert main([*common, "--tolerance", "157.2:157.5"]) == 0
     result = json.loads(found.read_text())["measurements"][0]
     assert result["verdict"] == "pass"
+    assert [q["name"] for q in result["quantities"]][:2] == ["included_angle", "first_a"]
     assert abs(result["value"] - ANGLE_DEG) < 4 * result["uncertainty"]
     assert "157.3" in capsys.readouterr().out
     assert main([*common, "--tolerance", ":157.0"]) == 1
     assert json.loads(found.read_text())["measurements"][0]["verdict"] == "fail"
+    capsys.readouterr()
+    # Slopes have no unit; c is a length, in micrometres: 0 at the groove's bottom, to noise.
+    slope = ["--quantity", "first_a", "--tolerance=-0.21:-0.19"]
+    assert main([*common, *slope]) == 0
+    assert "pass (first_a)" in capsys.readouterr().out
+    assert main([*common, "--quantity", "first_c", "--tolerance=-0.5:0.5"]) == 0
+    assert main([*common, "--quantity", "first_c", "--tolerance=0.5:1e3"]) == 1
+    assert main([*common, "--quantity", "radius", "--tolerance=0:1"]) == 1
+    assert "angle has no quantity 'radius'" in capsys.readouterr().err
 
 
 def test_every_measurement_has_its_option(groove, tmp_path, capsys) -> None:
@@ -110,7 +120,7 @@ def test_every_measurement_has_its_option(groove, tmp_path, capsys) -> None:
     "options",
     [[], ["--tolerance", "1:2"], ["--plane=0,0,1"], ["--csv", "x.csv", "--groove"],
      ["--plane=50,50,60,60"], ["--angle=0,0,1,1"], ["--groove", "--picture", "x.png"],
-     ["--groove", "--region=0,0,1,1"]],
+     ["--groove", "--region=0,0,1,1"], ["--groove", "--quantity", "first_a"]],
 )  # fmt: skip
 def test_requests_that_make_no_sense_are_refused(options, groove, tmp_path, capsys) -> None:
     save_pcd(tmp_path / "cloud.pcd", groove, organised=True)

@@ -98,6 +98,11 @@ def add_parser(subparsers: Any) -> None:
         help="limits of the value, in the unit in which it is told; one measurement only",
     )  # fmt: skip
     parser.add_argument(
+        "--quantity", metavar="NAME",
+        help="what the tolerance is for, as --json names it: Sa, centre_x, a, ... (default: the "
+        "value); lengths in mm of sphere, cylinder and hole, else in µm",
+    )  # fmt: skip
+    parser.add_argument(
         "--region", type=numbers_of, metavar=RECTANGLE, help="where to compare (default: all over)"
     )
     parser.add_argument(
@@ -117,6 +122,8 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"nothing to measure; expected one of --{', --'.join(FEATURES)}, --x3p")
     if args.tolerance is not None and len(wanted) != 1:
         raise ConfigError(f"--tolerance with {len(wanted)} measurements; expected one")
+    if args.quantity is not None and args.tolerance is None:
+        raise ConfigError("--quantity says what a tolerance is for; expected --tolerance as well")
     if args.csv is not None and args.profile is None:
         raise ConfigError("--csv writes a section; expected --profile as well")
     if args.picture is not None and (args.profile is None) == (args.reference is None):
@@ -127,13 +134,15 @@ def run(args: argparse.Namespace) -> int:
     verdicts, results = [], []
     for measure in wanted:
         found = measure(points)
-        verdict = _verdict(found, args.tolerance)
+        verdict = _verdict(found, args.tolerance, args.quantity)
         for line in lines(found):
             say(line)
         if verdict:
-            say(f"{'tolerance':<18}{verdict}")
+            say(f"{'tolerance':<18}{verdict}{f' ({args.quantity})' if args.quantity else ''}")
         verdicts.append(verdict)
-        results.append({**_plain(found.to_dict()), "verdict": verdict or None})
+        quantities = [quantity._asdict() for quantity in found.quantities()]
+        plain = _plain(found.to_dict())
+        results.append({**plain, "quantities": quantities, "verdict": verdict or None})
         if isinstance(found, ProfileMeasurement) and args.csv is not None:
             save_profile(args.csv, found)
         if args.picture is not None:
@@ -194,11 +203,13 @@ def told(found: Measurement) -> tuple[float, str]:
     return 1.0 / MICROMETRE_M, "µm"
 
 
-def _verdict(found: Measurement, tolerance: Tolerance | None) -> str:
-    factor, _ = told(found)
+def _verdict(found: Measurement, tolerance: Tolerance | None, name: str | None) -> str:
+    """Verdict on one quantity, of which lengths are in the unit of the kind."""
     if tolerance is None:
         return ""
-    return tolerance.verdict(factor * found.value, factor * found.uncertainty)
+    judged = found.quantity(name)
+    factor = told(found)[0] if judged.unit == "m" else 1.0
+    return tolerance.verdict(factor * judged.value, factor * judged.uncertainty)
 
 
 def lines(found: Measurement) -> Iterator[str]:

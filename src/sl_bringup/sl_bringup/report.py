@@ -58,7 +58,7 @@ def write_page(path: Path, report: Mapping[str, Any], pictures: Mapping[str, byt
     """
     live = report["bag"] == "live"
     title = f"Scan {report['scan_id']}" + (", live" if live else f" of {report['bag']}")
-    parts = [f"<h1>{_text(title)}</h1>", verdict_line(report["good"], report["reasons"])]
+    parts = [f"<h1>{_text(title)}</h1>", verdict_line(report)]
     parts += [_table(heading, rows) for heading, rows in _sections(report)]
     parts += [
         f'<h2>{_text(caption)}</h2><img alt="{_text(caption)}" '
@@ -76,12 +76,14 @@ def page(title: str, parts: Sequence[str]) -> str:
     )
 
 
-def verdict_line(good: bool, reasons: Sequence[str]) -> str:
-    """Banner: good, or not good and why."""
-    if good:
-        return '<p class="verdict good">Good</p>'
-    why = "; ".join(reasons)
-    return f'<p class="verdict bad">Not good: {_text(why)}</p>'
+def verdict_line(report: Mapping[str, Any]) -> str:
+    """Banner: good, or not good and why; a live cloud that differs is never green."""
+    if not report["good"]:
+        return f'<p class="verdict bad">Not good: {_text("; ".join(report["reasons"]))}</p>'
+    live = report.get("live", {})
+    if live.get("agrees") is False:
+        return f'<p class="verdict bad">Good by itself, but {_text(live["told"])}</p>'
+    return '<p class="verdict good">Good</p>'
 
 
 def _sections(report: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

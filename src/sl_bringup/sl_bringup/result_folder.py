@@ -71,7 +71,7 @@ def write_summary(
         if (output / title / "report.html").is_file():
             title = f'<a href="{title}/report.html">{title}</a>'
         parts.append(f"<h2>{title}</h2>")
-        parts.append(verdict_line(report["good"], report["reasons"]))
+        parts.append(verdict_line(report))
     write_text(output / "index.html", page(name, parts))
 
 

@@ -103,15 +103,9 @@ def carry_out(order: Order, points: Points) -> Answer:
     # A wrong tolerance is told before the measurement takes its time.
     limits = Tolerance(*order.tolerance) if order.tolerance else None
     found = _measure(order, points)
-    quantities = found.quantities()
-    named = {quantity.name: quantity for quantity in quantities}
-    if order.quantity and order.quantity not in named:
-        raise ConfigError(
-            f"{order.kind} has no quantity {order.quantity!r}; expected one of {', '.join(named)}"
-        )
-    judged = named[order.quantity] if order.quantity else quantities[0]
+    judged = found.quantity(order.quantity)
     verdict = limits.verdict(judged.value, judged.uncertainty) if limits else ""
-    return Answer(found, quantities, judged, verdict)
+    return Answer(found, found.quantities(), judged, verdict)
 
 
 def _measure(order: Order, points: Points) -> Measurement:

@@ -118,6 +118,21 @@ class Measurement:
         """All that was measured, the value first."""
         return (Quantity(self.value_name, self.value, self.uncertainty, self.unit), *self._others())
 
+    def quantity(self, name: str | None = None) -> Quantity:
+        """One quantity by its name, the value without.
+
+        Raises
+        ------
+        ConfigError
+            When it has none of this name.
+        """
+        named = {quantity.name: quantity for quantity in self.quantities()}
+        if name and name not in named:
+            raise ConfigError(
+                f"{self.kind} has no quantity {name!r}; expected one of {', '.join(named)}"
+            )
+        return named[name or self.value_name]
+
     def _others(self) -> Iterator[Quantity]:
         """Quantities beside the value; a kind that has some says them."""
         yield from ()
