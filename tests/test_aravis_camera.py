@@ -18,7 +18,7 @@ from sl_bench.camera_emulator import CameraEmulator
 from sl_bench.camera_faults import CameraFaults
 from sl_bench.gige_camera import GigeCamera
 from sl_camera.aravis_camera import AravisCamera, AravisOptions
-from sl_camera.aravis_library import list_cameras
+from sl_camera.aravis_library import list_cameras, load_aravis
 from sl_camera.camera import CameraDriver, CameraSettings, Frame, FrameStatus
 from sl_projector.errors import DeviceError, DeviceLost, DeviceRefused
 
@@ -91,6 +91,31 @@ def test_frames_that_lack_packets_are_incomplete() -> None:
         assert frame.image.shape == (512, 512)
         assert camera.statistics().incomplete == 1
         camera.close()
+
+
+def test_a_camera_that_is_not_on_gige_vision_has_no_packets() -> None:
+    """What a USB3 Vision camera goes through, by Aravis' camera without a transport.
+
+    No packet sizes, no packet counters.
+    """
+    require_gi()
+    aravis = load_aravis()
+    aravis.enable_interface("Fake")
+    try:
+        camera = AravisCamera("Fake_1", AravisOptions(packet_size=9000))
+        camera.open()
+        camera.configure(SMALL)
+        camera.arm()
+        for i in range(5):
+            camera.software_trigger()
+            (frame,) = read(camera, 1)
+            assert (frame.status, frame.frame_id) == (FrameStatus.OK, 65401 + i)
+        assert camera.statistics().lost == 0
+        assert "missing_packets" not in camera.packets()
+        camera.close()
+    finally:
+        aravis.disable_interface("Fake")
+        aravis.update_device_list()
 
 
 def test_a_camera_that_another_program_controls_is_told() -> None:
