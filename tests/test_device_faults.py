@@ -124,6 +124,7 @@ BORNE = [
     dmd("reply late", "", late_replies=1, late_s=0.4),
     dmd("reply stale", "", stale_replies=2),
     dmd("report short", "", short_replies=1),
+    dmd("reply without data", "", empty_replies=2),
     dmd("stall", "", stalls=1),
     dmd("edge doubled", "", doubled_edges={3}),
 ]

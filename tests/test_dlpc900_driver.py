@@ -416,6 +416,16 @@ def test_short_reply_is_asked_for_again(bench):
     assert_next_scan_is_right(bench)
 
 
+def test_reply_without_data_is_asked_for_again(bench):
+    bench.faults.empty_replies = 5
+    assert bench.driver.status().ok
+    bench.faults.empty_replies = 100
+    with pytest.raises(DeviceError, match="with 0 bytes; expected at least 1"):
+        bench.driver.status()
+    bench.faults.empty_replies = 0
+    assert_next_scan_is_right(bench)
+
+
 @pytest.mark.parametrize("fault", ["lose_replies", "short_replies"])
 def test_silent_device_times_out_and_the_next_open_mends_it(bench, fault):
     setattr(bench.faults, fault, 2)

@@ -28,6 +28,8 @@ class Dlpc900Faults:
         So many next replies are preceded by one with an old sequence byte.
     short_replies : int
         So many next replies are cut to 3 bytes.
+    empty_replies : int
+        So many next replies come without their data.
     stalls : int
         So many next transfers stall (EPIPE).
     kernel_driver : bool
@@ -49,6 +51,7 @@ class Dlpc900Faults:
     late_s: float = 0.1
     stale_replies: int = 0
     short_replies: int = 0
+    empty_replies: int = 0
     stalls: int = 0
     kernel_driver: bool = False
     taken: bool = False

@@ -161,6 +161,8 @@ class EmulatedUsb:
             if faults.take("stale_replies"):
                 old = bytes([reply[0], (reply[1] - 1) & 0xFF])
                 self._replies.append((ready_s, (old + reply[2:4] + b"\xff" * 60)))
+            if faults.take("empty_replies"):
+                reply = reply[:2] + bytes(len(reply) - 2)
             if faults.take("short_replies"):
                 reply = reply[:SHORT_REPORT_BYTES]
             self._replies.append((ready_s, reply))

@@ -19,6 +19,8 @@ from sl_projector.transport import HidTransport
 REPLY_TIMEOUT_S = 2.0  # TI's own software waits so long
 _DRAIN_TIMEOUT_S = 0.002
 _MAX_DRAINED = 256
+# Public drivers meet answers without data from devices that were asked too soon, and ask again.
+_EMPTY_PAUSE_S, _MAX_EMPTY = 0.05, 5
 
 
 class Dlpc900Port:
@@ -80,7 +82,13 @@ class Dlpc900Port:
             When the answer is shorter than expected.
         """
         with self._lock:
-            reply = self._twice(lambda: self._exchange(command, b"", read=True))
+            reply = self._ask(command)
+            for _ in range(_MAX_EMPTY):
+                if reply.data or reply.refused or not size:
+                    break
+                pause_until_ns = self._clock.now_ns() + int(_EMPTY_PAUSE_S * 1e9)
+                self._clock.wait_until(pause_until_ns, threading.Event())
+                reply = self._ask(command)
             self._refuse(command, reply)
         if len(reply.data) < size:
             raise DeviceError(
@@ -131,6 +139,9 @@ class Dlpc900Port:
                     f"{protocol.ERRORS.get(code, 'undefined error')}{self._error_text()}, "
                     f"after {step}"
                 )
+
+    def _ask(self, command: int) -> protocol.Reply:
+        return self._twice(lambda: self._exchange(command, b"", read=True))
 
     def _twice(self, exchange: Callable[[], protocol.Reply]) -> protocol.Reply:
         try:
