@@ -49,6 +49,22 @@ def test_pattern_table_entry_flags_lie_where_the_guide_puts_them():
     assert entry == bytes.fromhex("02 01 05 04 03 80 08 07 06 01 11 B8")
 
 
+def test_pattern_table_entries_are_those_of_tis_batch_file():
+    """From the on-the-fly batch file that comes with TI's program: a gray image bit by bit."""
+    tis = {
+        (0, 0, 8, 0, 1): "00 00 A0 86 01 1F 00 00 00 00 00 00",
+        (1, 1, 7, 0, 1): "01 00 A0 86 01 1D 00 00 00 00 00 08",
+        (7, 7, 1, 150_000, 1): "07 00 A0 86 01 11 F0 49 02 00 00 38",
+        (55, 7, 1, 150_000, 7): "37 00 A0 86 01 71 F0 49 02 00 00 38",
+    }
+    for (index, bit, depth, dark_us, leds), words in tis.items():
+        entry = protocol.lut_entry(
+            index, 100_000, dark_us, 0, bit, depth=depth, leds=leds, clear=True
+        )
+        assert entry == bytes.fromhex(words)
+    assert protocol.lut_config(56, 0) == bytes.fromhex("38 00 00 00 00 00")
+
+
 def test_image_load_is_tis_on_the_fly_example():
     stream = bytes(6057)
     assert protocol.image_init(0, len(stream)) == bytes.fromhex("00 00 A9 17 00 00")
