@@ -368,6 +368,15 @@ def test_compressed_image_with_a_miscounted_header_is_shown_unless_strict(host):
     assert strict.upload(0, stream) == 6
 
 
+def test_empty_part_after_the_last_one_harms_nothing(host):
+    assert host.upload(0, image(WHITE)) == 0
+    assert host.write(0x1A2B, 0, 0) == 0
+    assert host.write(0x1A2B, 1, 0, 0xFF) == 7
+    host.define()
+    assert host.write(0x1A31, 1, 0, 1, 0, 0, 0) == 0
+    assert host.device.pattern(0).all()
+
+
 def test_flips_turn_the_mirrors(host):
     # The left half of the columns and the upper half of the rows are lit.
     row = bytes.fromhex("80 04 FFFFFF 80 04 000000")

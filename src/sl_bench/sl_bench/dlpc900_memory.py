@@ -77,9 +77,11 @@ class ImageMemory:
         """Take the next part of the image (0x1A2B, 0x1A2D); the last one decodes it."""
         target = self._controller(controller)
         upload = target.upload
+        count = struct.unpack_from("<H", data)[0] & 0x3FF
+        if not count:  # Pycrafter6500 and its kin end so where the parts fill the image
+            return
         if upload is None:
             raise Refusal(NOT_PRESENT, "image data without its start")
-        count = struct.unpack_from("<H", data)[0] & 0x3FF
         if len(data) - 2 < count:
             raise Refusal(INVALID_PARAMETER, f"chunk of {len(data) - 2} bytes; it says {count}")
         upload.data += data[2 : 2 + count]
