@@ -16,6 +16,7 @@ from sl_camera.grbl_protocol import (
     ALARMS_KEEPING_POSITION,
     ECHO,
     RESET,
+    RESUME,
     STATUS,
     UNTOLD_ALARM,
     Report,
@@ -129,7 +130,7 @@ class GrblConversation:
         self._banner_wanted = True
         self._late_banners_until = -math.inf  # of resets that were repeated: no surprise either
         self._break = 0  # counts alarms and resets: whoever waits for an answer stops waiting
-        self._resync = False
+        self._resync = self._refused = False
         self._link = SerialLines(port, baud, self._on_line, self._on_lost)
 
     def close(self, last_bytes: bytes = b"") -> None:
@@ -323,24 +324,29 @@ class GrblConversation:
         with self._line_lock:
             if self._resync:
                 self.reset()
-            with self._cv:
-                self._replies.clear()
-                started = self._break
-            self.write(line.encode("ascii") + b"\n")
-            reply = self._await_reply(line, started, Patience(timeout_s), poll_s, may_be_lost)
-        if reply != "ok":
-            if line.startswith("$J"):
-                self._resync = True  # grblHAL would refuse all moves after a jog that it refused
+            if self._refused and self.version.lower().startswith("grblhal"):
+                self._send_line("$G", Patience(self.reply_timeout_s), poll_s, False)
+            reply = self._send_line(line, Patience(timeout_s), poll_s, may_be_lost)
+        # grblHAL refuses all G-code after a refusal, until a $ line that it accepts
+        self._refused = reply != "ok"
+        if self._refused:
             raise DeviceRefused(f"GRBL refuses {line!r}: {error_text(reply)}")
 
-    def _await_reply(
-        self, line: str, started: int, patience: Patience, poll_s: float, may_be_lost: bool
-    ) -> str:
+    def _send_line(self, line: str, patience: Patience, poll_s: float, may_be_lost: bool) -> str:
+        with self._cv:
+            self._replies.clear()
+            started = self._break
+        self.write(line.encode("ascii") + b"\n")
+        pushed_at: Triple | None = None
         while not self._wait(lambda: bool(self._replies) or self._break != started, poll_s):
             patience.spend(self.state_word, self.machine_mm)
             if may_be_lost and patience.idle_s > IDLE_WITHOUT_REPLY_S:
-                self._resync = True
-                return "ok"
+                if pushed_at == self.machine_mm:
+                    self._resync = True
+                    return "ok"
+                # grbl-sim on a busy machine runs out of steps: idle, with the rest still planned
+                pushed_at, patience.idle_s = self.machine_mm, 0.0
+                self.write(RESUME)
             if patience.is_over:
                 self._resync = True
                 raise DeviceTimeout(f"no answer to {line!r} {patience.text}")

@@ -7,7 +7,6 @@ stage rests where its word and its position say so, more than once.
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 
@@ -16,7 +15,7 @@ from sl_camera.grbl_protocol import HOLD, JOG_CANCEL, UNTOLD_ALARM, Report
 from sl_projector.errors import DeviceError, DeviceTimeout
 
 IDLE_REPORTS = 3  # in a row, at one place
-JOGGING_REPORTS = 5  # after so many a cancelled jog is held as well
+DEAF_REPORTS = 10  # that show no halt: the command was not heard. GRBL's second report shows it
 UNKNOWN_BRAKING_MM = 100.0
 
 
@@ -65,18 +64,20 @@ def halt(talk: GrblConversation) -> None:
     """
     jogging = talk.state_word == "Jog"
     talk.write(JOG_CANCEL if jogging else HOLD)
-    watch, enough_mm = _Watch(talk), 2.0 * _braking_mm(talk.settings) + 1.0
-    for count in itertools.count(1):
-        report = watch.look("halted")
-        if watch.is_resting(report):
-            return
-        if watch.travelled_mm > enough_mm and not report.is_braking:
+    watch, braking_mm, in_vain = _Watch(talk), _braking_mm(talk.settings), 0
+    while not watch.is_resting(report := watch.look("halted")):
+        # a jog that is cancelled is called so until it rests
+        may_brake = report.state == "Jog" and watch.travelled_mm < 2.0 * braking_mm + 1.0
+        in_vain += not (may_brake or report.is_braking or report.state == "Idle")
+        if in_vain < DEAF_REPORTS:
+            continue
+        if not jogging:
             raise DeviceError(
-                f"told to halt, the controller has moved on by {watch.travelled_mm:.1f} mm, "
-                f"expected at most {enough_mm:.1f} mm of braking (state {report.state})"
+                f"told to halt, the controller has moved on by {watch.travelled_mm:.1f} mm "
+                f"and says {report.state}"
             )
-        if jogging and count == JOGGING_REPORTS and report.state == "Jog":
-            talk.write(HOLD)  # ends a jog too, also where 0x85 is not known
+        jogging, in_vain = False, 0
+        talk.write(HOLD)  # ends a jog too, also where 0x85 is not known
 
 
 def _braking_mm(settings: dict[int, float]) -> float:
