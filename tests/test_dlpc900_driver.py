@@ -10,6 +10,7 @@ import pytest
 from dlpc900_bench import Bench
 from sl_projector.clock import SystemClock
 from sl_projector.dlpc900 import Dlpc900Settings
+from sl_projector.dlpc900_port import Dlpc900Port
 from sl_projector.dmd import Timing, TriggerIn, TriggerOut, dmd_model
 from sl_projector.errors import (
     ConfigError,
@@ -459,6 +460,32 @@ def test_refused_command_says_why_and_the_next_load_works(bench):
     with pytest.raises(DeviceRefused, match=r"error 8, out of memory: .*refused on request"):
         bench.driver.load(named("paper"), FAST)
     assert_next_scan_is_right(bench)
+
+
+class Queue:
+    """A transport that keeps every report until it is read, as an operating system's may."""
+
+    def __init__(self, device):
+        self._device, self._reports = device, []
+
+    def write(self, report, timeout_s):
+        self._reports += self._device.receive(report)
+
+    def read(self, timeout_s):
+        if not self._reports:
+            raise DeviceTimeout("nothing came")
+        return self._reports.pop(0)
+
+
+def test_letters_of_a_long_error_text_are_not_taken_for_an_answer(bench):
+    """The text (0x0101) has 128 bytes, three reports; the second's second byte is a letter here."""
+    bench.emulator._fail = lambda *_: setattr(bench.emulator, "_error_text", "A" * 127)
+    bench.faults.refuse = 1
+    port = Dlpc900Port(Queue(bench.emulator))
+    port._sequence = ord("A") - 4  # refused, error code, text: then comes number 65, an A
+    with pytest.raises(DeviceRefused, match="A" * 60):
+        port.write(0x1A24, b"\0")
+    assert port.read(0x1A0C) == b"\0"
 
 
 def test_refused_image_data_is_found_though_it_has_no_reply(bench):

@@ -188,6 +188,7 @@ class Dlpc900Port:
         """Return the device's own words, or nothing when it has none."""
         try:
             text = self.read(protocol.ERROR_TEXT, 0).split(b"\0")[0].decode("ascii", "replace")
+            self.drain()  # the text's further reports, whose letters may look like an answer
         except DeviceError:
             return ""
         return f": {text}" if text else ""
