@@ -30,10 +30,10 @@ AGREES_SD = 0.5
 #: A band of coefficients holds surface when its power exceeds the noise's by so many deviations.
 BAND_SD = 3.0
 #: Draws of noise for a bias (each with both signs), to know its spectrum, and to repeat the
-#: estimate: a standard deviation of so many is known to 8 %.
-DRAWS, FEW, REPEATS = 100, 16, 80
-#: Part taken off of the bias that noise left in the estimate hides.
-HIDDEN = 0.5
+#: estimate: a standard deviation of so many is known to 6.5 %.
+DRAWS, FEW, REPEATS = 100, 16, 120
+#: Powers of the noise's variance with which a bias may grow: near ties to a single peak.
+GROWTHS = np.linspace(0.5, 1.0, 51)
 #: Heights with noise at once: bounds memory.
 AT_ONCE = 2_000_000
 #: Of the polynomial that is taken out before cosines.
@@ -117,21 +117,25 @@ def extremes(
 
     Notes
     -----
-    Noise that is left in the estimate hides a part of the bias: none where the bias grows with
-    the square of the noise (one peak, rounded off), and 1 - (sqrt(1 + left) - sqrt(left)) where
-    it grows with the noise (near ties). The middle is taken off. The uncertainty is the scatter
-    of the whole estimate, repeated on the estimated surface (double bootstrap).
+    Noise that is left in the estimate hides a part of the bias. A bias that grows with a power p
+    of the noise's variance is hidden but for (1 + left)^p - left^p of it: nothing is hidden where
+    one peak is rounded off (p = 1), more where many heights nearly tie (p = 1/2). Half the noise
+    tells which. The uncertainty is the scatter of the whole estimate, repeated on the estimated
+    surface (double bootstrap).
     """
     alone = noise[:, there]
     parts = np.array_split(alone, min(len(alone), 1 + alone.size // AT_ONCE))
 
+    def bias(z: Array, scale: float = 1.0) -> Array:
+        tops = [_tops(both) for part in parts for both in (z + scale * part, z - scale * part)]
+        return np.asarray(np.concatenate(tops).mean(axis=0) - _tops(z))
+
     def corrected(measured: Array) -> Array:
         clean, left = estimate(measured)
-        z = clean[there]
-        tops = [_tops(both) for part in parts for both in (z + part, z - part)]
-        bias = np.concatenate(tops).mean(axis=0) - _tops(z)
-        hidden = bias * (1.0 / (np.sqrt(1.0 + left) - np.sqrt(left)) - 1.0)
-        return np.asarray(_tops(measured[there]) - bias - HIDDEN * hidden)
+        whole = bias(clean[there])
+        power = _growth(bias(clean[there], 0.5), whole, left)
+        shown = (1.0 + left) ** power - left**power
+        return np.asarray(_tops(measured[there]) - whole / shown)
 
     values = corrected(heights)
     clean = estimate(heights)[0]
@@ -140,6 +144,13 @@ def extremes(
     spread = repeated.std(axis=0, ddof=1)
     peak, valley, total = map(Corrected, values.tolist(), spread.tolist())
     return peak, valley, total
+
+
+def _growth(half: Array, whole: Array, left: float) -> Array:
+    """Power of the noise's variance with which biases grow, from those by half and whole noise."""
+    ratio = ((0.25 + left) ** GROWTHS - left**GROWTHS) / ((1.0 + left) ** GROWTHS - left**GROWTHS)
+    found = np.divide(half, whole, out=np.full_like(whole, ratio[-1]), where=whole > 0.0)
+    return np.interp(found, ratio[::-1], GROWTHS[::-1])
 
 
 def _tops(heights: Array) -> Array:
