@@ -73,7 +73,7 @@ def test_words_are_apart_and_jogs_relative(odd: Odd, stage: GrblStage) -> None:
     """As in the examples of GRBL's documents; simple simulators understand nothing else."""
     stage.move_to(0.001, 0.0, 0.0)
     stage.jog_by(0.0005, 0.0, -0.00025, speed_m_s=0.01)
-    assert b"G21 G90 G94 G53 G0 X-24.0000 Y-25.0000 Z-10.0000\n" in odd.heard
+    assert b"G0 G53 G21 G90 G94 X-24.0000 Y-25.0000 Z-10.0000\n" in odd.heard
     assert b"$J=G91 G21 X0.5000 Y0.0000 Z-0.2500 F600.0\n" in odd.heard
     until(lambda: stage.state().kind == "idle")
     assert stage.position_m() == pytest.approx((0.0015, 0.0, -0.00025), abs=1e-6)
@@ -143,11 +143,11 @@ def test_a_jog_is_held_where_its_cancel_is_not_known(odd: Odd, stage: GrblStage)
 
 def test_stopped_after_the_dwell_was_answered(odd: Odd, stage: GrblStage) -> None:
     """An ``ok`` that comes too early leaves the end of the move to the reports."""
-    odd.deaf_to = b"P"  # "G40.01", which is refused instead of waiting
+    odd.deaf_to = b"P"  # "G4 0.01", which is refused instead of waiting
     odd.change = lambda _, sent: re.sub(rb"error:\d+", b"ok", sent)
     odd.clock.run_at(0.5)
     mover = under_way(odd, stage, 0.024)
-    until(lambda: b"G4P" in odd.heard)
+    until(lambda: b"G4 P" in odd.heard)
     stage.stop()
     assert stage.state().kind == "idle"
     assert "the controller was stopped" in str(mover.ended())

@@ -18,6 +18,7 @@ from sl_camera.stage import Position, StageLimits, StageState
 from sl_projector.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
 
 HOMING_POLL_S = 0.5  # an AVR answers no status while it homes, and need not be pestered
+PATIENCE_AT_START = 5  # a simulator on a busy machine may need ten seconds for its first answer
 NEEDED_SETTINGS = (130, 131, 132)
 
 
@@ -71,7 +72,7 @@ class GrblStage:
             if first is not None and first.state in ("Run", "Jog", "Hold", "Door"):
                 halt(talk)
             talk.know_banner()
-            talk.exchange("$$", self._reply_timeout_s)
+            talk.exchange("$$", PATIENCE_AT_START * self._reply_timeout_s)
             missing = [n for n in NEEDED_SETTINGS if n not in talk.settings]
             if missing:
                 raise DeviceError(f"{self.port} has no settings {missing}, expected $130 to $132")
@@ -213,14 +214,15 @@ class GrblStage:
         with self._owning_motion("moving", "idle") as talk:
             talk.exchange(self._move_line(target_mm), self._reply_timeout_s)
             breaks = talk.breaks
-            talk.exchange("G4P0.01", timeout_s, may_be_lost=True)
+            talk.exchange("G4 P0.01", timeout_s, may_be_lost=True)
             talk.wait_state(lambda report: report.state == "Idle", "idle")
             verify(talk, target_mm, breaks)
 
     def _move_line(self, target_mm: Triple) -> str:
         x, y, z = target_mm
-        rate = "G0" if self._speed_m_s is None else f"G1 F{self._speed_m_s * 6e4:.1f}"
-        return f"G21 G90 G94 G53 {rate} X{x:.4f} Y{y:.4f} Z{z:.4f}"
+        speed = self._speed_m_s
+        line = f"{'G1' if speed else 'G0'} G53 G21 G90 G94 X{x:.4f} Y{y:.4f} Z{z:.4f}"
+        return f"{line} F{speed * 6e4:.1f}" if speed else line
 
     def jog_by(self, dx_m: float, dy_m: float, dz_m: float, *, speed_m_s: float) -> None:
         """Start a relative motion and return; ``stop()`` ends it at any time.
