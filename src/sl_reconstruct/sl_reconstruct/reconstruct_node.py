@@ -435,7 +435,9 @@ class ReconstructNode(RigNode):
             if not self.count_publishers(topic):
                 return f"nobody publishes {topic}: is the {node} node running?"
         if self._ready and not self._workshop.calibration_hash and not self._file:
-            return "no calibration is in force: set the parameter calibration_file"
+            return (
+                "no calibration is in force: run 'slrig calibrate' or name a file (--calibration)"
+            )
         return ""
 
     def project(self, watch: ScanWatch, order: ScanOrder) -> None:
