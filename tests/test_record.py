@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import signal
 import subprocess
 import sys
@@ -27,6 +28,7 @@ from sl_bringup.bags import (
     typestore,
 )
 from sl_bringup.cli import main
+from sl_bringup.progress import StatusLine
 from sl_bringup.record import size_bytes
 from sl_projector.errors import BagError, ConfigError
 from sl_projector.sequence import named
@@ -327,3 +329,22 @@ def test_a_sequence_is_smaller_than_the_queue() -> None:
         max(len(named(name)) for name in ("precise", "paper", "precise-rows"))
         <= topic_qos(IMAGE).depth
     )
+
+
+@pytest.mark.parametrize("size", ["5", "0.9MB"])
+def test_a_split_without_a_unit_does_not_make_thousands_of_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], size: str
+) -> None:
+    assert main(["record", "--output", str(tmp_path / "bag"), "--split", size]) == 1
+    assert "expected 1MB at least" in capsys.readouterr().err
+
+
+def test_a_log_hears_only_of_what_changed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now_s = itertools.count(0.0, 60.0)
+    monkeypatch.setattr(time, "monotonic", lambda: next(now_s))
+    status = StatusLine("recording")
+    for text in ("nothing", "nothing", "nothing", "one message"):
+        status.show(text)
+    assert capsys.readouterr().err == "recording: nothing\nrecording: one message\n"

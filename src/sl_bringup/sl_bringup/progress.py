@@ -87,12 +87,14 @@ class StatusLine:
         self._what = what
         self._terminal = sys.stderr.isatty()
         self._next_s = time.monotonic() + _LOG_S
+        self._told = ""
 
     def show(self, text: str) -> None:
-        """Tell how it stands."""
+        """Tell how it stands; a log hears of it when it has changed."""
         if self._terminal:
             sys.stderr.write(f"\r{self._what}: {text} ")
             sys.stderr.flush()
-        elif time.monotonic() >= self._next_s:
+        elif time.monotonic() >= self._next_s and text != self._told:
             self._next_s = time.monotonic() + _LOG_S
+            self._told = text
             complain(f"{self._what}: {text}")

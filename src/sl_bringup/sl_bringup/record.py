@@ -47,6 +47,10 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run)
 
 
+#: Of smaller files there would be one for every message or so.
+LEAST_SPLIT = 1_000_000
+
+
 def size_bytes(words: str) -> int:
     """Bytes of ``500MB``, ``2GB``, ``1000000``.
 
@@ -63,6 +67,9 @@ def size_bytes(words: str) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Carry out ``slrig record``; the recorder takes this process's place."""
-    words = ["--output", str(args.output), "--split", str(size_bytes(args.split))]
+    split = size_bytes(args.split)
+    if 0 < split < LEAST_SPLIT:
+        raise ConfigError(f"--split {args.split} is {split} bytes; expected 1MB at least, or 0")
+    words = ["--output", str(args.output), "--split", str(split)]
     words += [f"--{name}" for name in ("all", "compress") if getattr(args, name)]
     return become_client(CLIENT, args, words)
