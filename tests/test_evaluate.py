@@ -202,6 +202,21 @@ def test_a_dropped_image_refuses_its_scan_alone(
     assert [p.name for p in (tmp_path / "out" / "scan_0002").iterdir()] == ["report.json"]
 
 
+def test_images_that_make_no_cloud_are_shown(
+    tmp_path: Path, sequence: PatternSequence, frames: np.ndarray
+) -> None:
+    """Two images exchanged: no cloud, but a page with what the camera saw of the patterns."""
+    exchanged = frames[[0, 2, 1, *range(3, len(frames))]]
+    bag = record(tmp_path / "bag", sequence, exchanged, rig=tiny_rig())
+    status, (report,) = evaluate(bag, tmp_path / "out")
+    assert (status, report["good"], report["complete"]) == (1, False, True)
+    folder = tmp_path / "out" / "scan_0001"
+    assert [p.name for p in folder.glob("*.png")] == ["picture_contrast.png"]
+    page = Page((folder / "report.html").read_text())
+    assert len(page.sources) == 1 and "Pattern contrast" in page.text
+    assert not (folder / "cloud.ply").exists()
+
+
 def test_a_stage_that_moved_refuses_the_scan(
     tmp_path: Path, sequence: PatternSequence, frames: np.ndarray
 ) -> None:
