@@ -66,8 +66,9 @@ def halt(talk: GrblConversation) -> None:
     talk.write(JOG_CANCEL if jogging else HOLD)
     watch, braking_mm, in_vain = _Watch(talk), _braking_mm(talk.settings), 0
     while not watch.is_resting(report := watch.look("halted")):
-        # a jog that is cancelled is called so until it rests
-        may_brake = report.state == "Jog" and watch.travelled_mm < 2.0 * braking_mm + 1.0
+        # a jog that is cancelled is called so until it rests, and not all know of Hold:1
+        near = watch.travelled_mm < 2.0 * braking_mm + 1.0
+        may_brake = near and report.state in ("Jog", "Hold", "Door")
         in_vain += not (may_brake or report.is_braking or report.state == "Idle")
         if in_vain < DEAF_REPORTS:
             continue
