@@ -1,6 +1,8 @@
 """``slrig measure`` on files of clouds, and the paper's naive decoding."""
 
 import json
+import os
+import zipfile
 
 import numpy as np
 import pytest
@@ -101,6 +103,7 @@ def test_measure_tells_value_uncertainty_and_verdict(groove, tmp_path, capsys) -
 
 def test_every_measurement_has_its_option(groove, tmp_path, capsys) -> None:
     save_pcd(tmp_path / "cloud.pcd", groove, organised=True)
+    os.utime(tmp_path / "cloud.pcd", (1.7e9, 1.7e9))
     section = tmp_path / "section.csv"
     status = main([
         "measure", str(tmp_path / "cloud.pcd"), "--plane=-1.5,-1,-0.5,1",
@@ -113,7 +116,8 @@ def test_every_measurement_has_its_option(groove, tmp_path, capsys) -> None:
     assert "Z = -0.2000" in out
     assert "included angle" in out
     assert section.is_file()
-    assert (tmp_path / "map.x3p").is_file()
+    with zipfile.ZipFile(tmp_path / "map.x3p") as archive:  # dated as the cloud, not as the export
+        assert b"<Date>2023-11-14T22:13:20+00:00</Date>" in archive.read("main.xml")
 
 
 @pytest.mark.parametrize(

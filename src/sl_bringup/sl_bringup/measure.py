@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -148,7 +149,7 @@ def run(args: argparse.Namespace) -> int:
         if args.picture is not None:
             _draw(args.picture, points, found, args.cloud.name)
     if args.x3p is not None:
-        _write_x3p(args.x3p, points)
+        _write_x3p(args.x3p, points, args.cloud)
     if args.json is not None:
         write_json(args.json, {"format": 1, "cloud": str(args.cloud), "measurements": results})
     return 0 if all(verdict in ("", "pass") for verdict in verdicts) else 1
@@ -168,10 +169,11 @@ def _wanted(args: argparse.Namespace) -> list[Callable[[Points], Measurement]]:
     return wanted
 
 
-def _write_x3p(path: Path, points: Points) -> None:
+def _write_x3p(path: Path, points: Points, cloud: Path) -> None:
+    """Write a height map that is as old as its cloud."""
     if points.ndim != 2:
         raise StackError("--x3p needs an organised cloud; expected cloud.pcd or height.tiff")
-    save_x3p(path, make_height_map(points))
+    save_x3p(path, make_height_map(points), datetime.fromtimestamp(cloud.stat().st_mtime, UTC))
 
 
 def _draw(path: Path, points: Points, found: Measurement, title: str) -> None:

@@ -60,7 +60,7 @@ def _main_xml(height: HeightMap, checksum: str, made: datetime) -> bytes:
             "Instrument": dict.fromkeys(("Manufacturer", "Model", "Serial", "Version"), UNKNOWN),
             "CalibrationDate": made.isoformat(),
             "ProbingSystem": {"Type": "NonContacting", "Identification": "structured light"},
-            "Comment": "slrig",
+            "Comment": "slrig; CalibrationDate is not known and the same as Date",
         },
         "Record3": {
             "MatrixDimension": {
