@@ -65,7 +65,7 @@ def under_way(odd: Odd, stage: GrblStage, x_m: float) -> Mover:
     """A move that the carriage has begun."""
     start = odd.position_m()
     mover = Mover(stage, x_m, 0.0, 0.0)
-    until(lambda: odd.position_m() != start)
+    until(lambda: odd.position_m() != start, timeout_s=30.0)
     return mover
 
 
@@ -75,7 +75,7 @@ def test_words_are_apart_and_jogs_relative(odd: Odd, stage: GrblStage) -> None:
     stage.jog_by(0.0005, 0.0, -0.00025, speed_m_s=0.01)
     assert b"G0 G53 G21 G90 G94 X-24.0000 Y-25.0000 Z-10.0000\n" in odd.heard
     assert b"$J=G91 G21 X0.5000 Y0.0000 Z-0.2500 F600.0\n" in odd.heard
-    until(lambda: stage.state().kind == "idle")
+    until(lambda: stage.state().kind == "idle", timeout_s=30.0)
     assert stage.position_m() == pytest.approx((0.0015, 0.0, -0.00025), abs=1e-6)
 
 
@@ -131,7 +131,7 @@ def test_a_stop_that_is_not_heard_ends_in_a_reset(odd: Odd, stage: GrblStage, si
 
 
 def test_a_jog_is_held_where_its_cancel_is_not_known(odd: Odd, stage: GrblStage) -> None:
-    odd.clock.run_at(0.25)
+    odd.clock.run_at(0.1)
     odd.deaf_to = b"\x85"
     stage.jog_by(0.024, 0.0, 0.0, speed_m_s=0.02)
     stage.stop()
@@ -145,9 +145,9 @@ def test_stopped_after_the_dwell_was_answered(odd: Odd, stage: GrblStage) -> Non
     """An ``ok`` that comes too early leaves the end of the move to the reports."""
     odd.deaf_to = b"P"  # "G4 0.01", which is refused instead of waiting
     odd.change = lambda _, sent: re.sub(rb"error:\d+", b"ok", sent)
-    odd.clock.run_at(0.5)
+    odd.clock.run_at(0.1)
     mover = under_way(odd, stage, 0.024)
-    until(lambda: b"G4 P" in odd.heard)
+    until(lambda: b"G4 P" in odd.heard, timeout_s=30.0)
     stage.stop()
     assert stage.state().kind == "idle"
     assert "the controller was stopped" in str(mover.ended())
@@ -157,9 +157,11 @@ def test_stopped_after_the_dwell_was_answered(odd: Odd, stage: GrblStage) -> Non
 def test_an_alarm_without_its_line(odd: Odd, stage: GrblStage) -> None:
     stage.home()
     assert stage.state().referenced
-    odd.clock.run_at(1.0)
+    odd.clock.run_at(0.1)
     odd.change = lambda _, sent: re.sub(rb"ALARM:\d\r\n", b"", sent)
     mover = under_way(odd, stage, 0.02)
+    # the dwell has been read, else it is refused
+    until(lambda: odd.heard.rfind(b"?") > odd.heard.find(b"G4 P0.01\n") >= 0, timeout_s=30.0)
     odd.alarm(3)
     assert "did not say why" in str(mover.ended())
     state = stage.state()
@@ -225,7 +227,7 @@ def test_the_banner_of_a_repeated_reset_is_no_power_cycle(odd: Odd, stage: GrblS
 
     odd.change = delayed
     odd.alarm(2)
-    until(lambda: stage.state().kind == "alarm")
+    until(lambda: stage.state().kind == "alarm", timeout_s=30.0)
     stage.clear()
     assert odd.heard.count(b"\x18") > 1
     assert stage.state().kind == "idle"
