@@ -35,7 +35,7 @@ class Figures:
     noise_read_dn2, noise_shot_dn : float
         Pixel noise: variance = noise_read_dn2 + noise_shot_dn * level, DN^2.
     edge_sigma_px : float
-        Median stated standard deviation of an edge position, camera pixels.
+        Median standard deviation of an edge position from noise alone, camera pixels.
     edge_bound_px : float
         Least standard deviation that an unbiased estimator can have on the same edges.
     order : float
@@ -67,7 +67,8 @@ class Cloud:
     ----------
     points : ndarray, (H, K) of CLOUD_DTYPE
         World x, y, z in metres, intensity (DN under full light), sigma (1-sigma of z from the
-        edge noise, metres); NaN where there is no point.
+        edge's noise and from what bends and uneven light may do to it, metres); NaN where there
+        is no point.
     u_px : ndarray, (H, K) float32
         Camera column of the boundary, pixels; NaN where there is no point.
     reason : ndarray, (H, K) uint8

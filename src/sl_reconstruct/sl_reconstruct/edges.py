@@ -71,7 +71,8 @@ class Tuning(NamedTuple):
     blur does not matter. ``around_px``: a fine stripe's half width. ``scale``: camera pixels per
     DMD pixel. ``floor_dn``: keeps quotients finite. ``least_width``, ``most_width``: of an edge,
     over what is expected. ``noise_dn2``, ``noise_dn``: variance = noise_dn2 + noise_dn * level.
-    ``jump_px``: a centre may lie so far from where the edges on a side lead.
+    ``jump_px``: a centre may lie so far from where the edges on a side lead. ``blur_px``: the
+    standard deviation of an edge's blur.
     """
 
     direction: int
@@ -90,6 +91,7 @@ class Tuning(NamedTuple):
     noise_dn2: float
     noise_dn: float
     jump_px: float
+    blur_px: float
 
 
 class SourceRow(NamedTuple):

@@ -8,7 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sl_reconstruct.edges import PRESENT
+from sl_reconstruct.bends import widen_edges
+from sl_reconstruct.edges import PRESENT, Tuning
 from sl_reconstruct.geometry import (
     DEPTH,
     DZ,
@@ -195,10 +196,14 @@ def _row(g: Geometry, y: int, columns: Any, lines: Any, bad: Any, r: Array, out:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def triangulate_rows(
-    first: int, last: int, g: Geometry, columns: Any, lines: Any, screen: Screen, out: Output,
-    r: Array, around: Around,
+    first: int, last: int, g: Geometry, columns: Any, lines: Any, screen: Screen, t: Tuning,
+    out: Output, r: Array, around: Around,
 ) -> None:  # fmt: skip
-    """Screen and triangulate rows first to last. columns: observed DMD column of each boundary."""
+    """Screen and triangulate rows first to last. columns: observed DMD column of each boundary.
+
+    Widens the lines' sigma, which says what noise does, by what bends and uneven light do.
+    """
     for y in range(first, last):
+        widen_edges(t, lines.u_px[y], lines.level_dn[y], lines.sigma_px[y])
         find_steps(lines.u_px, y, screen, around)
         _row(g, y, columns, lines, around.bad, r, out)

@@ -139,7 +139,7 @@ class Reconstructor:
 
     def _reconstruct(self, stack: NDArray[Any], saturation: int) -> Cloud:
         column = self.plan.column
-        _, lines, figures = self._decode(
+        state, lines, figures = self._decode(
             stack, column, self.plan.white, self.plan.black, saturation
         )
         out = _output(*lines.u_px.shape)
@@ -149,10 +149,11 @@ class Reconstructor:
         figures = replace(figures, light_change=light)
         columns = np.arange(column.size_px, dtype=np.float64) - 0.5
         screen = _screen(self.settings, figures)
+        arguments = self._geometry, columns, lines, screen, state.tuning, out
 
         def work(first: int, last: int) -> None:
             scratch = ray_tile(), around_row(column.size_px)
-            triangulate_rows(first, last, self._geometry, columns, lines, screen, out, *scratch)
+            triangulate_rows(first, last, *arguments, *scratch)
 
         share_rows(work, stack.shape[1])
         crossed = self._cross(stack, lines, columns, out, saturation) if self.plan.row else None
@@ -279,10 +280,15 @@ def make_layout(plan: AxisPlan, white: int, black: int) -> Layout:
         for s in plan.sources
     ]
     bits = [(b.image, b.inverse, b.flipped) for b in plan.bits]
+    turns = np.flatnonzero(np.diff(centre_owner >= 0, prepend=False, append=False))
+    centres = [
+        (first, stop, plan.sources[centre_owner[first]].half_period_px)
+        for first, stop in turns.reshape(-1, 2).tolist()
+    ]
     return Layout(
         np.array(sources, np.int64), edge_owner, centre_owner, np.array(bits, np.int64),
         np.array(plan.images, np.int64), white, black, plan.dynamic,
-        any(s.centres for s in plan.sources),
+        np.array(centres, np.int64).reshape(-1, 3),
     )  # fmt: skip
 
 
@@ -295,7 +301,7 @@ def first_tuning(plan: AxisPlan, settings: Settings, saturation: int) -> Tuning:
         size_px=plan.size_px, floor_dn=0.002 * saturation, lit_dn=0.5 * contrast_dn,
         contrast_dn=contrast_dn, saturation=saturation,
         least_width=0.0, most_width=np.inf, min_light=settings.min_light,
-        noise_dn2=0.0, noise_dn=0.0, jump_px=settings.max_jump_px,
+        noise_dn2=0.0, noise_dn=0.0, jump_px=settings.max_jump_px, blur_px=FIRST_BLUR_PX,
     )  # fmt: skip
 
 
@@ -322,7 +328,7 @@ def survey(
     tuning = tuning._replace(scale=scale, around_px=max(3, int(np.ceil(stripe_px)) + 3))
     blur_px = settings.edge_blur_px or measure_blur(few, plan, layout, tuning.scale)
     tuning = tuning._replace(
-        reach_px=max(2, int(np.ceil(REACH_SD * blur_px))),
+        reach_px=max(2, int(np.ceil(REACH_SD * blur_px))), blur_px=blur_px,
         least_width=1 / settings.max_slope, most_width=1 / max(settings.min_slope, 1e-9),
     )  # fmt: skip
     matched = settings.estimator == "matched"

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from sl_reconstruct.bends import find_centres
 from sl_reconstruct.edges import (
     FRACTION,
     PRESENT,
@@ -52,9 +53,10 @@ from sl_reconstruct.reasons import Reason
 
 #: BR8's slope depends on the stripe's width and blur more than an edge's does.
 BAR_LATITUDE = 3.0
+#: So many boundaries that are not found are looked for one by one.
+FEW = 12
 
 ORDER = int(Reason.ORDER)
-STEP = int(Reason.STEP)
 MISSING = int(Reason.MISSING)
 
 
@@ -64,7 +66,8 @@ class Layout(NamedTuple):
     ``sources``: (n, 6) image, inverse, half period, rising, edges, centres. ``edge_owner``,
     ``centre_owner``: which source gives each boundary, -1 for none. ``bits``: (m, 3) image,
     inverse, flipped. ``images``: all images of the axis. ``dynamic``: some source
-    is a single image; ``centres``: some source gives centres.
+    is a single image; ``centres``: (c, 3) first and last boundary, plus 1, of each run of those
+    that centres give, and how far from them their edges are.
     """
 
     sources: NDArray[np.int64]
@@ -75,7 +78,7 @@ class Layout(NamedTuple):
     white: int
     black: int
     dynamic: bool
-    centres: bool
+    centres: NDArray[np.int64]
 
 
 class Lines(NamedTuple):
@@ -196,72 +199,6 @@ def _source(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _average_centres(plan: Layout, out: Found) -> None:
-    """The centre of a stripe lies midway between its two edges, which one image shows."""
-    owner, edge_owner, sources = plan.centre_owner, plan.edge_owner, plan.sources
-    u_px, sigma_px, width_px, reason = out.u_px, out.sigma_px, out.width_px, out.reason
-    for k in range(owner.size):
-        if owner[k] < 0:
-            continue
-        half = sources[owner[k], 2]
-        a, b = k - half, k + half
-        if reason[a] == PRESENT and reason[b] == PRESENT and edge_owner[a] == edge_owner[b]:
-            u_px[k] = np.float32(0.5) * (u_px[a] + u_px[b])
-            sigma_px[k] = np.float32(0.5) * np.sqrt(sigma_px[a] ** 2 + sigma_px[b] ** 2)
-            width_px[k] = width_px[a]
-            reason[k] = PRESENT
-        elif reason[a] > UNLIT or reason[b] > UNLIT:
-            reason[k] = max(reason[a], reason[b])
-
-
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _lead(
-    u_px: Any, reason: Any, owner: Any, start: int, step: int, count: int
-) -> tuple[int, float, float]:
-    """Nearest edge from ``start`` on, its column, and the pace from it to the farthest one.
-
-    Looks at ``count`` boundaries; the pace is NaN where there are fewer than two edges.
-    """
-    near, pace = -1, np.nan
-    at = 0.0
-    for i in range(count):
-        k = start + step * i
-        if 0 <= k < owner.size and owner[k] >= 0 and reason[k] == PRESENT:
-            if near < 0:
-                near, at = k, np.float64(u_px[k])
-            else:
-                pace = (u_px[k] - at) / (k - near)
-    return near, at, pace
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _check_centres(plan: Layout, t: Tuning, out: Found) -> None:
-    """Refuse centres to which the edges on both sides do not lead.
-
-    A centre is taken from edges D away, so a depth step or a kink between them goes unseen.
-    """
-    edge_owner, centre_owner, u_px, reason = (
-        plan.edge_owner, plan.centre_owner, out.u_px, out.reason,
-    )  # fmt: skip
-    k, n = 0, reason.size
-    while k < n:
-        if centre_owner[k] < 0:
-            k += 1
-            continue
-        first, half = k, plan.sources[centre_owner[k], 2]
-        while k < n and centre_owner[k] >= 0:
-            k += 1
-        a, u_a, pace_a = _lead(u_px, reason, edge_owner, first - 1, -1, half)
-        b, u_b, pace_b = _lead(u_px, reason, edge_owner, k, 1, half)
-        for i in range(first, k):
-            left = abs(u_px[i] - u_a - pace_a * (i - a))
-            right = abs(u_px[i] - u_b - pace_b * (i - b))
-            if reason[i] == PRESENT and not (left <= t.jump_px and right <= t.jump_px):
-                reason[i] = STEP
-                u_px[i] = np.nan
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _levels(p: PixelRow, dynamic: bool, out: Found) -> None:
     """Bright level at every found boundary, DN."""
     u_px, level_dn, threshold, light, high = out.u_px, out.level_dn, p.threshold, p.light, p.high
@@ -313,6 +250,15 @@ def _see(p: PixelRow, seen: Any) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _count_lit(p: PixelRow, division: int) -> int:
+    """Number of lit pixels in a division."""
+    code, lit, q, n = p.code, p.lit, np.uint16(division), np.int32(0)
+    for x in range(code.size):
+        n += np.int32(code[x] == q) & np.int32(lit[x])
+    return int(n)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _account(
     plan: Layout, p: PixelRow, seen: Any, blind: Any, division_px: int, reason: Any
 ) -> None:
@@ -327,7 +273,12 @@ def _account(
         return
     seen[:] = 0
     blind[:] = 0
-    _see(p, seen)
+    if unfound > FEW:
+        _see(p, seen)
+    else:
+        for k in range(first, last):
+            if reason[k] == UNLIT:
+                seen[k // division_px] = min(2, _count_lit(p, k // division_px))
     if p.any_clipped[0]:
         _lose(p, seen.size, blind)
     for k in range(first, last):
@@ -353,10 +304,7 @@ def _row(
     decode_pixels(stack, y, plan, t, p)
     for s in range(plan.sources.shape[0]):
         _source(stack, y, s, plan, f, t, p, r, found, lines.tally[i, s], bars)
-    if plan.centres:
-        if not bars:
-            _average_centres(plan, found)
-        _check_centres(plan, t, found)
+    find_centres(plan, bars, t, found)
     _levels(p, plan.dynamic, found)
     _account(plan, p, seen, blind, t.division_px, found.reason)
 

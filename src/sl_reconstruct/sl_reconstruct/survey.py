@@ -120,10 +120,13 @@ def fit_noise(scatter: Array) -> Noise:
 
 
 def _bin_mean(part: Array) -> tuple[float, float, float]:
-    limit = 8 * np.median(part[:, 1]) + 0.5
-    good = part[part[:, 1] <= limit]
-    freedom = good[:, 2] - 1
-    return float(good[:, 0].mean()), float(np.average(good[:, 1], weights=freedom)), freedom.sum()
+    level, variance, count = part.T
+    middle = (len(part) - 1) // 2, len(part) // 2
+    low, high = np.partition(variance, middle)[list(middle)].tolist()
+    good = variance <= 4 * (low + high) + 0.5
+    level, variance, freedom = level[good], variance[good], count[good] - 1
+    total = float(freedom.sum())
+    return float(level.mean()), float((variance * freedom).sum()) / total, total
 
 
 def edge_bound(scatter: Array, noise: Noise, blur_px: float) -> float:
