@@ -74,6 +74,28 @@ def test_noise_is_taken_off_the_roughness() -> None:
     assert [q.name for q in m.quantities()][:2] == ["Sq", "Sa"]
 
 
+def test_noise_that_differs_from_place_to_place_is_taken_off_the_kurtosis() -> None:
+    """A cosine has Sku 1.5. Noise of 0.1 um on one half and 0.3 on the other has a fourth cumulant
+    of 3 (0.08 / 2)^2 um^4 and adds 0.31 to that: 3 * 0.0016 / 0.125^2.
+    """
+    wave = lambda x, y: 0.5e-6 * np.cos(2 * np.pi * x / 0.2e-3)  # noqa: E731
+    points = cloud(wave, (46, 61), (1.2e-3, 0.9e-3), 0.0)
+    points["sigma"] = np.where(points["y"] > 0.0, 0.1e-6, 0.3e-6)
+    points["z"] += points["sigma"] * np.random.default_rng(3).standard_normal(points.shape)
+    m = measure_roughness(points, step_m=2e-5)
+    assert m.uncertainties["Sku"] < 0.31 / 4.0
+    # 61 nodes are 6 waves and one more crest, of power two: Sku is 1.51.
+    assert m.corrected["Sku"] == pytest.approx(1.51, abs=3.0 * m.uncertainties["Sku"])
+
+
+def test_a_flat_has_no_shape_of_heights() -> None:
+    """Ssk and Sku divide by Sq, which is nothing but noise here."""
+    flat = cloud(lambda x, y: 0.0 * x, (46, 61), (1.2e-3, 0.9e-3), 0.08e-6)
+    m = measure_roughness(flat, step_m=2e-5)
+    assert m.corrected["Sq"] < 3.0 * m.uncertainty
+    assert np.isnan([m.corrected["Ssk"], m.corrected["Sku"]]).all()
+
+
 # -- X3P -------------------------------------------------------------------------------------------
 
 

@@ -34,6 +34,8 @@ SQUARES = ("Sa", "Sq", "Sdq")
 EXTREMES = ("Sp", "Sv", "Sz")
 #: Repetitions of the points' noise that tell bias and uncertainty; of extremes, as many as fit.
 DRAWS, MANY, HEIGHTS = 48, 120, 50_000_000
+#: Ssk and Sku are powers of 1 / Sq: told where Sq is at least so many uncertainties.
+KNOWN = 3.0
 MICROMETRE_M = 1e-6
 
 
@@ -47,7 +49,8 @@ class RoughnessMeasurement(Measurement):
         Parameters as the height map has them: what any program finds in it. Metres for Sa, Sq,
         Sp, Sv and Sz, numbers for Ssk, Sku, Sdr and Sdq.
     corrected, uncertainties : dict of str to float
-        The same less what the points' stated noise adds, and standard uncertainties.
+        The same less what the points' stated noise adds, and standard uncertainties; Ssk and Sku
+        are NaN where Sq is less than three of its uncertainties.
     step_m : float
         Distance of the map's nodes, metres.
     """
@@ -210,15 +213,25 @@ def _corrected(
     # Highest and lowest of levelled heights are Sp and Sv themselves.
     level = np.stack([_levelled(draw) for draw in noise])
     tops = extremes(inner, level, estimate, np.ones(inner.shape, np.bool_))
-    return found | dict(zip(EXTREMES, tops, strict=True)) | _shapes(raw, found)
+    return found | dict(zip(EXTREMES, tops, strict=True)) | _shapes(raw, found, noise)
 
 
-def _shapes(raw: dict[str, float], found: dict[str, Corrected]) -> dict[str, Corrected]:
-    """Ssk and Sku: third and fourth cumulant of normal noise are none, so only Sq changes."""
-    grown = raw["Sq"] / max(found["Sq"].value, 1e-3 * raw["Sq"])
+def _shapes(
+    raw: dict[str, float], found: dict[str, Corrected], noise: Array
+) -> dict[str, Corrected]:
+    """Ssk and Sku from central moments, less the noise's: no third cumulant, and a fourth one
+    where its variance differs from place to place. Unknown (NaN) where Sq is.
+    """
+    if not found["Sq"].value > KNOWN * found["Sq"].uncertainty:
+        return dict.fromkeys(("Ssk", "Sku"), Corrected(float("nan"), float("nan")))
+    variance = np.mean(noise**2, axis=0)
+    # The square of a variance from n draws is too large by 2 / n.
+    fourth = np.mean(variance**2) / (1.0 + 2.0 / len(noise)) - np.mean(variance) ** 2
+    grown = raw["Sq"] / found["Sq"].value
+    excess = (raw["Sku"] - 3.0) * grown**4 - 3.0 * float(fourth) / found["Sq"].value ** 4
     return {
         "Ssk": Corrected(raw["Ssk"] * grown**3, found["Ssk"].uncertainty * grown**3),
-        "Sku": Corrected(3.0 + (raw["Sku"] - 3.0) * grown**4, found["Sku"].uncertainty * grown**4),
+        "Sku": Corrected(3.0 + excess, found["Sku"].uncertainty * grown**4),
     }
 
 
