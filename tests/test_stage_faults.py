@@ -13,9 +13,9 @@ from sl_bench.grbl_emulator import GrblEmulator
 from sl_bench.zaber_emulator import ZaberEmulator
 from sl_camera.grbl import GrblStage
 from sl_camera.manual_stage import ManualStage
-from sl_camera.zaber import ZaberStage
+from sl_camera.zaber import ZaberStage, zaber_axes
 from sl_camera.zaber_protocol import checksum, command, parse_reply
-from sl_projector.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
+from sl_projector.errors import ConfigError, DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
 from stage_bench import Clock, Mover, until
 
 
@@ -386,3 +386,21 @@ def test_the_emulator_remembers_where_the_carriage_stood(rig: Rig) -> None:
     assert places == sorted(places)
     assert any(0.0 < place < 0.002 for place in places)
     assert rig.emulator.position_at(after_ns + 10**9)[0] == pytest.approx(0.002, abs=1e-9)
+
+
+def test_zaber_controller_of_several_axes() -> None:
+    """Zaber's X-MCC: `/01 2 ...` is the second axis of the first device."""
+    with ZaberEmulator(homed=True, one_controller=True, clock=Clock()) as emulator:
+        stage = ZaberStage(emulator.port, zaber_axes((1, 1, 1), (1, 3, 2)), reply_timeout_s=0.2)
+        stage.open()
+        stage.move_to(1e-3, 2e-3, 3e-3)
+        assert emulator.position_m() == pytest.approx((1e-3, 3e-3, 2e-3), abs=0.05e-6)
+        stage.close()
+
+
+@pytest.mark.parametrize(
+    "lists", [{"devices": (1, 2)}, {"axes": (1,)}, {"microsteps_m": ()}, {"signs": (1, 1, 1, 1)}]
+)
+def test_zaber_lists_that_are_not_of_three_axes(lists: dict[str, tuple[int, ...]]) -> None:
+    with pytest.raises(ConfigError, match="expected one for each of x, y, z"):
+        zaber_axes(**lists)

@@ -20,12 +20,12 @@ _COMMAND = re.compile(r"/(\d*) ?(\d?) ?(\d\d)? ?([a-z][^:]*)?(?::([0-9A-F]{2}))?
 
 
 class ZaberDevice:
-    """One device with one axis; positions in microsteps.
+    """One axis of a device; positions in microsteps.
 
     Parameters
     ----------
-    address : int
-        In the chain.
+    address, axis : int
+        The device's place in the chain, and which of its axes this is.
     limit_max : int
         Reach: 0 to this.
     position : int
@@ -34,8 +34,10 @@ class ZaberDevice:
         Whether it knows.
     """
 
-    def __init__(self, address: int, limit_max: int, position: int, referenced: bool) -> None:
-        self.address, self.limit_max = address, limit_max
+    def __init__(
+        self, address: int, axis: int, limit_max: int, position: int, referenced: bool
+    ) -> None:
+        self.address, self.axis, self.limit_max = address, axis, limit_max
         self.carriage = float(position)
         self.offset = 0.0 if referenced else self.carriage  # it believes carriage - offset
         self.flags = set() if referenced else {"WR"}
@@ -137,7 +139,7 @@ class ZaberDevice:
 
 
 class ZaberEmulator:
-    """The chain on its cable; addresses 1, 2, 3 are x, y, z.
+    """The chain on its cable; addresses 1, 2, 3 are x, y, z, or the axes of one controller.
 
     Parameters
     ----------
@@ -147,6 +149,8 @@ class ZaberEmulator:
         Length of a microstep.
     homed : bool
         Start referenced.
+    one_controller : bool
+        One device of three axes instead of three devices.
     clock : callable
         Seconds, increasing. A faster clock makes a faster stage.
     seed : int
@@ -159,13 +163,15 @@ class ZaberEmulator:
         travel_m: Triple = (0.05, 0.05, 0.02),
         microstep_m: float = 0.047625e-6,
         homed: bool = False,
+        one_controller: bool = False,
         clock: Callable[[], float] = time.monotonic,
         seed: int = 0,
     ) -> None:
         self._microstep_m, self._clock = microstep_m, clock
         limits = [round(travel / microstep_m) for travel in travel_m]
         self.devices = [
-            ZaberDevice(i + 1, limit, limit // 2, homed) for i, limit in enumerate(limits)
+            ZaberDevice(*((1, i) if one_controller else (i, 1)), limit, limit // 2, homed)
+            for i, limit in enumerate(limits, 1)
         ]
         self._lock = threading.Lock()
         self._pending = b""
@@ -258,15 +264,20 @@ class ZaberEmulator:
         if lrc is not None and (sum(line[1:-3].encode()) + int(lrc, 16)) % 256:
             return b""  # a damaged command is for nobody
         called = [d for d in self.devices if int(address or 0) in (0, d.address)]
+        # A controller speaks once: as the axis that is called, else as its first.
+        speakers = {d.address: d for d in reversed(called)}
+        speakers |= {d.address: d for d in called if d.axis == int(axis or 0)}
         return b"".join(
             self._reply(d, int(axis or 0), number, (data or "").strip(), lrc is not None, now)
-            for d in called
+            for d in speakers.values()
         )
 
     def _reply(
         self, device: ZaberDevice, axis: int, number: str | None, data: str, lrc: bool, now: float
     ) -> bytes:
-        accepted, answer = device.obey(data, now) if axis < 2 else (False, "BADAXIS")
+        accepted, answer = (
+            device.obey(data, now) if axis in (0, device.axis) else (False, "BADAXIS")
+        )
         words = [f"{device.address:02d}", str(axis), *([number] if number else [])]
         words += ["OK" if accepted else "RJ", "BUSY" if device.busy else "IDLE", device.flag()]
         text = " ".join([*words, answer])

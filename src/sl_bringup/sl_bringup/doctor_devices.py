@@ -21,7 +21,7 @@ from sl_camera.aravis_library import find_camera, list_cameras, load_aravis
 from sl_camera.camera_drivers import make_camera
 from sl_camera.grbl import GrblStage
 from sl_camera.stage import StageDriver
-from sl_camera.zaber import ZaberAxis, ZaberStage
+from sl_camera.zaber import ZaberStage, zaber_axes
 from sl_projector.dlpc350 import Dlpc350
 from sl_projector.dlpc900 import Dlpc900
 from sl_projector.dmd import DEFAULT_MODEL, MODELS, dmd_model
@@ -293,8 +293,11 @@ def _stage_state(kind: str, node: Path, parameters: dict[str, Any], running: boo
 def _stage_driver(kind: str, port: str, parameters: dict[str, Any]) -> StageDriver:
     baud = int(parameters.get("baud", 115200))
     if kind == "zaber":
-        axes = [ZaberAxis(int(device)) for device in parameters.get("zaber_devices", (1, 2, 3))]
-        return ZaberStage(port, axes, baud=baud)
+        where = (
+            parameters.get("zaber_devices", (1, 2, 3)),
+            parameters.get("zaber_axes", (1, 1, 1)),
+        )
+        return ZaberStage(port, zaber_axes(*where), baud=baud)
     return GrblStage(port, baud=baud, reply_timeout_s=STAGE_TIMEOUT_S)
 
 

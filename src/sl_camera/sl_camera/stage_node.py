@@ -16,7 +16,7 @@ from sl_camera.grbl import GrblStage
 from sl_camera.manual_stage import ManualStage
 from sl_camera.messages import stage_pose
 from sl_camera.stage import Position, StageDriver, StageState
-from sl_camera.zaber import ZaberAxis, ZaberStage
+from sl_camera.zaber import ZaberStage, zaber_axes
 from sl_projector.base_node import EVENTS, WORLD_FRAME, Health, RigNode, run
 from sl_projector.device_link import DeviceLink
 from sl_projector.errors import (
@@ -83,11 +83,12 @@ class StageNode(RigNode):
         self._speed_m_s = self.declare(
             "speed_m_s", 0.0, "speed of moves, m/s; 0: the controller's limit", 0.0, 1.0
         )
-        self._zaber_devices = self.declare(
-            "zaber_devices", [1, 2, 3], "addresses of the Zaber devices of x, y, z"
-        )
-        self._zaber_microstep_m = self.declare(
-            "zaber_microstep_m", [0.047625e-6] * 3, "microstep of x, y, z, m (data sheet)"
+        self._zaber = (
+            self.declare("zaber_devices", [1, 2, 3], "addresses of the Zaber devices of x, y, z"),
+            self.declare("zaber_axes", [1, 1, 1], "which axis of its device x, y, z each is"),
+            self.declare(
+                "zaber_microstep_m", [0.047625e-6] * 3, "microstep of x, y, z, m (data sheet)"
+            ),
         )
         self._home_at_start = self.declare("home_at_start", False, "home after connecting")
         self._period_s = 1.0 / self.declare("pose_rate_hz", 20.0, "poses a second", 1.0, 100.0)
@@ -118,9 +119,7 @@ class StageNode(RigNode):
         if not self._port:
             raise ConfigError("the parameter port is empty; expected a serial port")
         if self._kind == "zaber":
-            parts = zip(self._zaber_devices, self._zaber_microstep_m, self._signs, strict=True)
-            axes = [ZaberAxis(device, 1, step_m, sign) for device, step_m, sign in parts]
-            return ZaberStage(self._port, axes, baud=self._baud)
+            return ZaberStage(self._port, zaber_axes(*self._zaber, self._signs), baud=self._baud)
         x, y, z = self._signs
         return GrblStage(
             self._port,

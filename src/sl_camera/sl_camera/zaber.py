@@ -22,7 +22,13 @@ from sl_camera.zaber_protocol import (
     command,
     parse_reply,
 )
-from sl_projector.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
+from sl_projector.errors import (
+    ConfigError,
+    DeviceError,
+    DeviceLost,
+    DeviceRefused,
+    DeviceTimeout,
+)
 
 POLL_S = 0.05
 NO_REFERENCE = "position counts from where it was switched on"
@@ -53,6 +59,29 @@ class ZaberAxis:
     microstep_m: float = 0.047625e-6
     sign: int = 1
     origin_steps: int | None = None
+
+
+def zaber_axes(
+    devices: Sequence[int] = (1, 2, 3),
+    axes: Sequence[int] = (1, 1, 1),
+    microsteps_m: Sequence[float] = (ZaberAxis.microstep_m,) * 3,
+    signs: Sequence[int] = (1, 1, 1),
+) -> list[ZaberAxis]:
+    """Axes x, y, z from lists as a configuration has them.
+
+    Raises
+    ------
+    ConfigError
+        When a list does not have three values.
+    """
+    for name, values in (
+        ("zaber_devices", devices), ("zaber_axes", axes), ("zaber_microstep_m", microsteps_m),
+        ("signs", signs),
+    ):  # fmt: skip
+        if len(values) != 3:
+            raise ConfigError(f"{name} has {len(values)} values; expected one for each of x, y, z")
+    each = zip(devices, axes, microsteps_m, signs, strict=True)
+    return [ZaberAxis(int(device), int(axis), step, sign) for device, axis, step, sign in each]
 
 
 @dataclass
