@@ -24,6 +24,9 @@ STEP = int(Reason.STEP)
 
 #: So much of a squared measure of a bend, in its own variances, may be noise and is no bend.
 NOISE = 4.0
+#: A step of the light on one side, over a pixel or two, counts from twice as many deviations on:
+#: what is noise in it would move an edge by more than the edge's own noise.
+SIDE_NOISE = 4.0
 #: Variance of half a lead's miss over that of the centre: three edges and their extrapolation.
 LEAD_VARIANCE = 3.0
 
@@ -131,7 +134,7 @@ def widen_edges(t: Tuning, u_px: Any, level_dn: Any, sigma_px: Any) -> None:
     g is taken over four boundaries, or from one side where it is far steeper: beside a wall. Where
     a neighbour is missing, those on the other side say it.
     """
-    f, one, two, half = np.float32, np.float32(1), np.float32(2), np.float32(0.5)
+    f, one, half, side = np.float32, np.float32(1), np.float32(0.5), np.float32(SIDE_NOISE)
     light_px4, bent_px = f(t.blur_px**4), f((0.5 * t.blur_px / t.scale) ** 4)
     read, shot = f(2 * NOISE * t.noise_dn2), f(2 * NOISE * t.noise_dn)
     free = f(6 * NOISE)
@@ -147,8 +150,8 @@ def widen_edges(t: Tuning, u_px: Any, level_dn: Any, sigma_px: Any) -> None:
         curved = bent_px * _beyond(bend, free * own, one)
         # A level is that of the pixel which the boundary lies in.
         x, x_low, x_high = np.floor(u + half), np.floor(b + half), np.floor(c + half)
-        below = _beyond(here - low, two * noise, x - x_low)
-        above = _beyond(high - here, two * noise, x_high - x)
+        below = _beyond(here - low, side * noise, x - x_low)
+        above = _beyond(high - here, side * noise, x_high - x)
         low, x_low = (low, x_low) if b == b else (here, x)
         high, x_high = (high, x_high) if c == c else (here, x)
         low, x_low = (far_low, np.floor(a + half)) if a == a else (low, x_low)
