@@ -30,6 +30,7 @@ from sl_interfaces.msg import (  # noqa: E402
     PatternStack,
     PatternTrigger,
     RigCalibration,
+    ScanReport,
 )
 from sl_interfaces.msg import Pattern as PatternMsg  # noqa: E402
 from sl_interfaces.srv import Measure, MoveStage, Project, Scan  # noqa: E402
@@ -46,7 +47,7 @@ from sl_camera.messages import image_to_msg, pose_to_msg, stack_to_msg  # noqa: 
 from sl_camera.stage_node import StageNode  # noqa: E402
 from sl_camera.synchronizer_node import SynchronizerNode  # noqa: E402
 from sl_projector.base_node import EVENTS, IMAGES, LARGE, LATCHED  # noqa: E402
-from sl_projector.errors import ConfigError, DeviceError, DeviceLost  # noqa: E402
+from sl_projector.errors import ConfigError, DeviceError, DeviceLost, StackError  # noqa: E402
 from sl_projector.messages import stamp_from_msg, stamp_to_msg, trigger_to_msg  # noqa: E402
 from sl_projector.projector_node import ProjectorNode  # noqa: E402
 from sl_reconstruct.calibration_file import (  # noqa: E402
@@ -55,7 +56,8 @@ from sl_reconstruct.calibration_file import (  # noqa: E402
     save_calibration,
 )
 from sl_reconstruct.cloud_files import cloud_hash  # noqa: E402
-from sl_reconstruct.messages import cloud_from_msg  # noqa: E402
+from sl_reconstruct.messages import cloud_from_msg, refusals_from_msg  # noqa: E402
+from sl_reconstruct.reasons import REFUSALS, Reason  # noqa: E402
 from sl_reconstruct.reconstruct_node import ReconstructNode  # noqa: E402
 from tiny_scans import HEIGHT_M, SLOPE, render, tiny_rig, tiny_sequence  # noqa: E402
 
@@ -230,6 +232,8 @@ class Works:
         self.node = graph.add(ReconstructNode, calibration_file=str(calibration))
         self.stacks = graph.publisher(PatternStack, "synchronizer/stack", LARGE)
         self.clouds = graph.collect(PointCloud2, "reconstruct/points", LARGE)
+        self.refusals = graph.collect(Image, "reconstruct/refusals", LARGE)
+        self.reports = graph.collect(ScanReport, "reconstruct/report", EVENTS)
         wait(lambda: self.node.health().level == "ok", "the kernels", 200.0)
 
     def refused(self) -> int:
@@ -279,6 +283,23 @@ def disordered() -> PatternStack:
 
 def test_a_stack_that_nobody_asked_for_becomes_a_cloud(works: Works) -> None:
     works.expect_plane()
+
+
+def test_every_position_without_a_point_has_its_reason(works: Works) -> None:
+    works.refusals.clear()
+    works.reports.clear()
+    works.expect_plane()
+    image = wait(lambda: works.refusals and works.refusals[0], "the refusals")
+    report = wait(lambda: works.reports and works.reports[0], "the report")
+    cloud, codes = works.clouds[0], refusals_from_msg(image)
+    assert image.header.stamp == cloud.header.stamp
+    np.testing.assert_array_equal(codes == 0, np.isfinite(cloud_from_msg(cloud)["z"]))
+    counted = {REFUSALS[Reason(code)]: np.count_nonzero(codes == code) for code in range(2, 12)}
+    assert counted == {item.reason: item.count for item in report.refused}
+    assert report.points + sum(counted.values()) == report.lit_positions
+    image.height += 1
+    with pytest.raises(StackError, match="121 x 128 with 15360 bytes"):
+        refusals_from_msg(image)
 
 
 def test_the_last_cloud_can_be_measured(works: Works) -> None:

@@ -85,7 +85,7 @@ def graph(ros_domain: int) -> Iterator[Command]:
 
 
 def scan(output: Path, *arguments: str) -> tuple[int, dict[str, object], str]:
-    command = Command("scan", "--output", str(output), "--no-pictures", *arguments)
+    command = Command("scan", "--output", str(output), *arguments)
     status = command.end(patience_s=120.0)
     file = output / "report.json"
     return status, json.loads(file.read_text()) if file.is_file() else {}, command.text
@@ -99,14 +99,16 @@ def test_a_scan_of_the_groove(graph: Command, tmp_path: Path) -> None:
     assert report["groove"]["included_angle_deg"] == pytest.approx(155.92, abs=0.05)  # type: ignore[index]
     assert report["points"] == report["lit_positions"] - sum(report["refused"].values())  # type: ignore[attr-defined]
     assert PlyData.read(tmp_path / "cloud.ply")["vertex"].count == report["points"]
-    assert {"cloud.ply", "cloud.pcd", "height.tiff", "height.png", "report.json"} <= {
-        file.name for file in tmp_path.iterdir()
-    }
+    pictures = ("height", "relief", "residual", "profile", "refusals")
+    assert {file.name for file in tmp_path.iterdir()} == {
+        "cloud.ply", "cloud.pcd", "height.tiff", "height.png", "report.json", "report.html",
+        *(f"picture_{name}.png" for name in pictures),
+    }  # fmt: skip
     assert f"{report['points']:,} of" in told
 
 
 def test_a_sequence_that_does_not_exist_is_refused(graph: Command, tmp_path: Path) -> None:
-    status, report, told = scan(tmp_path, "--sequence", "zebra")
+    status, report, told = scan(tmp_path, "--sequence", "zebra", "--no-pictures")
     assert status == 1
     assert not report["good"]
     assert "zebra" in told

@@ -138,7 +138,7 @@ def _draw(cloud: Cloud, height: HeightMap | None, plane: Plane | None, title: st
         drawn["picture_residual"] = "Deviation from the best plane", picture
     if cloud.present:
         drawn["picture_profile"] = "Section", pictures.profile_picture(cloud.points, title)
-    # A live scan's message counts the reasons but does not map them.
+    # A live scan's map of them is a message of its own, which may be missing.
     if bool((cloud.reason > Reason.UNLIT).any()) or not any(cloud.refused.values()):
         drawn["picture_refusals"] = (
             "Why points are missing",

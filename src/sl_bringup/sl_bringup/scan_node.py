@@ -9,8 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rclpy.action import ActionClient
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import Image, PointCloud2
 from sl_interfaces.action import Scan
 from sl_interfaces.msg import ScanReport
 
@@ -18,7 +20,7 @@ from sl_bringup.client_node import GraphClient, run_client
 from sl_bringup.progress import complain, say
 from sl_bringup.scan_result import MEASURES, check_cloud, live_report, summary, write_result
 from sl_projector.base_node import LARGE
-from sl_reconstruct.messages import cloud_from_msg
+from sl_reconstruct.messages import cloud_from_msg, refusals_from_msg
 
 #: The cloud is sent before the action's result; it may still be later by so long.
 CLOUD_WAIT_S = 10.0
@@ -37,8 +39,10 @@ class ScanClient(GraphClient):
     def __init__(self, namespace: str) -> None:
         super().__init__("scan_client", namespace)
         self._cloud: PointCloud2 | None = None
+        self._refusals: Image | None = None
         self._action = ActionClient(self, Scan, "scan")
         self.create_subscription(PointCloud2, "reconstruct/points", self._take, LARGE)
+        self.create_subscription(Image, "reconstruct/refusals", self._take_refusals, LARGE)
 
     def connect(self, patience_s: float) -> None:
         """Wait for the graph.
@@ -72,6 +76,16 @@ class ScanClient(GraphClient):
     def _take(self, message: PointCloud2) -> None:
         self._cloud = message
 
+    def _take_refusals(self, message: Image) -> None:
+        self._refusals = message
+
+    def refusals(self) -> NDArray[np.uint8] | None:
+        """Why positions of the cloud hold no point; None where that did not arrive."""
+        cloud, message = self._cloud, self._refusals
+        if cloud is None or message is None or message.header.stamp != cloud.header.stamp:
+            return None
+        return refusals_from_msg(message)
+
     def _feedback(self, message: Any) -> None:
         told = message.feedback
         line = f"scan: {told.stage}, attempt {told.attempt}"
@@ -86,14 +100,19 @@ def fields_of(report: ScanReport) -> dict[str, Any]:
     return values
 
 
-def _deliver(args: argparse.Namespace, result: Any, cloud: PointCloud2 | None) -> int:
+def _deliver(
+    args: argparse.Namespace,
+    result: Any,
+    cloud: PointCloud2 | None,
+    refusals: NDArray[np.uint8] | None,
+) -> int:
     """Write and tell what came; the exit status."""
     report = live_report(fields_of(result.report), result.success, result.message)
     points = None if cloud is None or not result.success else cloud_from_msg(cloud)
     fault = check_cloud(points, report) if points is not None else ""
     if result.success and points is None:
         fault = "the scan succeeded, but its cloud did not arrive"
-    write_result(args.output, report, points, args.measure, not args.no_pictures)
+    write_result(args.output, report, points, args.measure, not args.no_pictures, refusals)
     for line in summary(report):
         say(line)
     if fault:
@@ -133,7 +152,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         goal = Scan.Goal(sequence=args.sequence, exposure_s=args.exposure, max_repeats=args.repeats)
         result, cloud = client.scan(goal, args.timeout)
         client.end_line()
-        return _deliver(args, result, cloud)
+        return _deliver(args, result, cloud, client.refusals())
 
     return run_client("slrig scan", work)
 

@@ -55,7 +55,12 @@ def live_report(answer: Mapping[str, Any], success: bool, message: str) -> dict[
 
 
 def write_result(
-    folder: Path, report: dict[str, Any], points: NDArray[Any] | None, measure: str, pictures: bool
+    folder: Path,
+    report: dict[str, Any],
+    points: NDArray[Any] | None,
+    measure: str,
+    pictures: bool,
+    reason: NDArray[np.uint8] | None = None,
 ) -> None:
     """Write cloud, height map, pictures, ``report.json`` and ``report.html``.
 
@@ -71,8 +76,10 @@ def write_result(
         Feature that is looked for, one of `MEASURES`, or empty.
     pictures : bool
         Whether pictures and the page are made.
+    reason : ndarray, (rows, columns), uint8, optional
+        Map of the refusals as published; without it, it is not drawn.
     """
-    cloud = None if points is None else _cloud(points, report)
+    cloud = None if points is None else _cloud(points, report, reason)
     with ThreadPoolExecutor(1) as beside:
         found = beside.submit(_measured, points, measure)
         drawn = write_scan(folder, report, cloud, pictures)
@@ -99,10 +106,13 @@ def check_cloud(points: NDArray[Any], report: Mapping[str, Any]) -> str:
     return f"cloud received has the hash {found[:12]}, the report {report['cloud_hash'][:12]}"
 
 
-def _cloud(points: NDArray[Any], report: Mapping[str, Any]) -> Cloud:
-    """Cloud as far as a message tells it: reasons are counted in it, not mapped."""
-    there = np.isfinite(points["z"])
-    reason = np.where(there, Reason.PRESENT, Reason.UNLIT).astype(np.uint8)
+def _cloud(
+    points: NDArray[Any], report: Mapping[str, Any], reason: NDArray[np.uint8] | None
+) -> Cloud:
+    """Cloud as far as messages tell it."""
+    if reason is None or reason.shape != points.shape:
+        there = np.isfinite(points["z"])
+        reason = np.where(there, Reason.PRESENT, Reason.UNLIT).astype(np.uint8)
     nothing = np.full(points.shape, np.nan, np.float32)
     refused = dict(report["refused"])
     return Cloud(points.astype(CLOUD_DTYPE, copy=False), nothing, reason, refused,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import Pose, Quaternion, TransformStamped, Vector3
 from numpy.typing import NDArray
-from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from sl_interfaces.msg import PatternStack, RefusalCount, RigCalibration, ScanReport
 
 from sl_projector.errors import SequenceError, StackError
@@ -135,6 +135,43 @@ def cloud_to_msg(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointClo
     message.header.frame_id = frame_id
     message._data = np.ascontiguousarray(points).reshape(-1).view(np.uint8)
     return message
+
+
+def refusals_to_msg(reason: NDArray[np.uint8], stamp_ns: int, frame_id: str) -> Image:
+    """Why each position of an organised cloud holds no point, as an image of `Reason` codes.
+
+    Parameters
+    ----------
+    reason : ndarray, (rows, columns), uint8
+        A code for each position of the cloud.
+    stamp_ns : int
+        The cloud's stamp.
+    frame_id : str
+        Frame of the camera, whose rows these are; columns are the cloud's.
+    """
+    rows, columns = reason.shape
+    message = Image(height=rows, width=columns, encoding="mono8", step=columns)
+    message.header.stamp = stamp_to_msg(stamp_ns)
+    message.header.frame_id = frame_id
+    message._data = np.ascontiguousarray(reason).reshape(-1)
+    return message
+
+
+def refusals_from_msg(message: Image) -> NDArray[np.uint8]:
+    """Codes of `Reason`, (rows, columns); a view into the message.
+
+    Raises
+    ------
+    StackError
+        When it is not an image of bytes.
+    """
+    codes = np.frombuffer(message.data, np.uint8)
+    if message.encoding != "mono8" or codes.size != message.height * message.width:
+        raise StackError(
+            f"refusals of {message.height} x {message.width} with {codes.size} bytes as "
+            f"{message.encoding!r}; expected mono8, a byte for each"
+        )
+    return codes.reshape(message.height, message.width)
 
 
 def report_to_msg(product: Product, stack: Stack) -> ScanReport:

@@ -19,7 +19,7 @@ from typing import Any
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import Image, PointCloud2
 from sl_interfaces.action import Scan
 from sl_interfaces.msg import MatchedFrame, PatternStack, RigCalibration, ScanReport
 from sl_interfaces.srv import Scan as ScanService
@@ -44,6 +44,7 @@ from sl_reconstruct.messages import (
     Stack,
     cloud_to_msg,
     frames_of,
+    refusals_to_msg,
     report_to_msg,
     rig_to_msg,
     stack_from_msg,
@@ -106,6 +107,7 @@ class ReconstructNode(RigNode):
         self._calibration_fault = "no calibration yet"
         self._last = "no stack yet"
         self._clouds = self.create_publisher(PointCloud2, "reconstruct/points", LARGE)
+        self._refusals = self.create_publisher(Image, "reconstruct/refusals", LARGE)
         self._reports = self.create_publisher(ScanReport, "reconstruct/report", EVENTS)
         self._rigs = self.create_publisher(RigCalibration, "calibration/rig", LATCHED)
         self.latch_settings("reconstruct/settings")(self._workshop.settings.to_dict())
@@ -333,12 +335,14 @@ class ReconstructNode(RigNode):
         good, reasons = verdict(product.cloud)
         if not good:
             raise ScanFailed(f"no cloud is published: {'; '.join(reasons)}")
-        self._clouds.publish(cloud_to_msg(product.cloud.points, stack.stamps_ns[0], WORLD_FRAME))
-        self._measuring.remember(product.cloud.points, stack.stamps_ns[0])
+        stamp_ns = stack.stamps_ns[0]
+        self._refusals.publish(refusals_to_msg(product.cloud.reason, stamp_ns, CAMERA_FRAME))
+        self._clouds.publish(cloud_to_msg(product.cloud.points, stamp_ns, WORLD_FRAME))
+        self._measuring.remember(product.cloud.points, stamp_ns)
         done_ns = time.time_ns()
         report = report_to_msg(product, stack)
         report.processing_s = (done_ns - came_ns) * 1e-9
-        report.acquisition_s = max(0.0, (came_ns - stack.stamps_ns[0]) * 1e-9)
+        report.acquisition_s = max(0.0, (came_ns - stamp_ns) * 1e-9)
         self._reports.publish(report)
         self.get_logger().info(
             f"scan {stack.scan_id}: {report.points} points {report.processing_s:.3f} s after the "
