@@ -211,6 +211,26 @@ def test_a_section_goes_to_csv(tmp_path) -> None:
     assert (back["u_z_m"] > 0).all()
 
 
+def test_a_section_is_of_the_line_and_a_tilt_is_no_scatter() -> None:
+    """Heights rise by 0.1 to the side, where half of the points are missing: 10 um on average."""
+    points = cloud(lambda x, y: 0.3 * x + 0.1 * y, (60, 100))
+    points["z"][(np.abs(points["y"]) < 0.2e-3) & (points["y"] < 0.0)] = np.nan
+    m = measure_profile(points, (-1e-3, 0.0), (1e-3, 0.0), 0.4e-3, 1e-4)
+    wrong = m.z_m - 0.3 * (m.along_m - 1e-3)
+    # 4 rows of 2 to 3 columns: a mean of 9 or so, and as much again for the way to the line.
+    assert np.all(m.u_z_m < 2.0 * SIGMA_M)
+    assert np.all(np.abs(wrong) < 4.5 * m.u_z_m)
+
+
+@pytest.mark.parametrize("half", [0.0, 2e-6])
+def test_extremes_without_noise_are_exact(half) -> None:
+    """No sigma is stated, and points of a bin do not scatter."""
+    points = cloud(lambda x, y: half * np.sign(x), (60, 100), sigma_m=0.0)
+    m = measure_profile(points, (-1e-3, 0.0), (1e-3, 0.0), 0.4e-3, 1e-4)
+    assert m.value == pytest.approx(2.0 * half, abs=1e-15)
+    assert m.uncertainty < 1e-15
+
+
 # -- regions and tolerances --------------------------------------------------------------------
 
 

@@ -133,7 +133,9 @@ def hole(seed: int) -> Scores:
 
 
 def profile(seed: int) -> Scores:
-    points = cloud(lambda x, y: 5e-5 * (np.abs(x) < 0.6e-3), (60, 100), seed=seed)
+    """A step on a part that is tilted across the section."""
+    form = lambda x, y: 5e-5 * (np.abs(x) < 0.6e-3) - 0.08 * y  # noqa: E731
+    points = cloud(form, (60, 100), seed=seed)
     m = measure_profile(points, (-1.9e-3, 0.0), (1.9e-3, 0.0), 0.4e-3, 5e-5)
     top = int(np.argmin(np.abs(m.along_m - 1.9e-3)))
     return {

@@ -36,6 +36,8 @@ DRAWS, FEW, REPEATS = 100, 16, 120
 GROWTHS = np.linspace(0.5, 1.0, 51)
 #: Heights with noise at once: bounds memory.
 AT_ONCE = 2_000_000
+#: A place without noise counts as one with so little of the mean variance.
+LEAST_VARIANCE = 1e-6
 #: Of the polynomial that is taken out before cosines.
 DEGREE = 4
 #: Coefficients of one band.
@@ -92,8 +94,11 @@ def peak_to_valley(heights: Array, noise_sd: Array, there: Mask) -> Corrected:
     Returns
     -------
     Corrected
-        Of a surface without form it scatters about 0 and may be negative.
+        Of a surface without form it scatters about 0 and may be negative. Exact (uncertainty 0)
+        where there is no noise.
     """
+    if not np.any(noise_sd[there]):
+        return Corrected(float(np.ptp(heights[there])), 0.0)
     filled, sd = (fill(np.where(there, a, np.nan)) for a in (heights, noise_sd))
     noise = sd * np.random.default_rng(0).standard_normal((DRAWS, *sd.shape))
     return extremes(filled, noise, choose(filled, noise), there)[2]
@@ -117,11 +122,12 @@ def extremes(
 
     Notes
     -----
-    Noise that is left in the estimate hides a part of the bias. A bias that grows with a power p
-    of the noise's variance is hidden but for (1 + left)^p - left^p of it: nothing is hidden where
-    one peak is rounded off (p = 1), more where many heights nearly tie (p = 1/2). Half the noise
-    tells which. The uncertainty is the scatter of the whole estimate, repeated on the estimated
-    surface (double bootstrap).
+    Noise that is left in the estimate hides a part of the bias, as far as it differs between the
+    places that may be the extreme. A bias that grows with a power p of the noise's variance is
+    hidden but for (1 + left)^p - left^p of it: nothing is hidden where one peak is rounded off
+    (p = 1), more where many heights nearly tie (p = 1/2). Half the noise tells which. The
+    uncertainty is the scatter of the whole estimate, repeated on the estimated surface (double
+    bootstrap).
     """
     alone = noise[:, there]
     parts = np.array_split(alone, min(len(alone), 1 + alone.size // AT_ONCE))
@@ -130,15 +136,17 @@ def extremes(
         tops = [_tops(both) for part in parts for both in (z + scale * part, z - scale * part)]
         return np.asarray(np.concatenate(tops).mean(axis=0) - _tops(z))
 
+    clean = estimate(heights)[0]
+    left = _left(estimate, clean, noise[:FEW], there)
+
     def corrected(measured: Array) -> Array:
-        clean, left = estimate(measured)
-        whole = bias(clean[there])
-        power = _growth(bias(clean[there], 0.5), whole, left)
+        z = estimate(measured)[0][there]
+        whole = bias(z)
+        power = _growth(bias(z, 0.5), whole, left)
         shown = (1.0 + left) ** power - left**power
         return np.asarray(_tops(measured[there]) - whole / shown)
 
     values = corrected(heights)
-    clean = estimate(heights)[0]
     some = noise[: REPEATS // 2]
     repeated = np.stack([corrected(clean + draw) for draw in (*some, *-some)])
     spread = repeated.std(axis=0, ddof=1)
@@ -146,11 +154,31 @@ def extremes(
     return peak, valley, total
 
 
-def _growth(half: Array, whole: Array, left: float) -> Array:
+def _left(estimate: Estimate, clean: Array, noise: Array, there: Mask) -> Array:
+    """Part of the noise's variance that an estimate keeps between places that may be extremes.
+
+    Of the highest, the lowest, and both. A plateau's mean is off everywhere alike: that is none.
+    """
+    alone = noise[:, there]
+    errors = np.stack([(estimate(clean + draw)[0] - clean)[there] for draw in noise])
+    both = np.concatenate([clean[there] + alone, clean[there] - alone])
+    places = both.argmax(axis=1), both.argmin(axis=1)
+    least = LEAST_VARIANCE * np.mean(alone**2)
+    high, low = (
+        float(np.mean(np.var(errors[:, at], axis=1)) / max(least, np.mean(alone[:, at] ** 2)))
+        for at in places
+    )
+    return np.array([high, low, 0.5 * (high + low)])
+
+
+def _growth(half: Array, whole: Array, left: Array) -> Array:
     """Power of the noise's variance with which biases grow, from those by half and whole noise."""
-    ratio = ((0.25 + left) ** GROWTHS - left**GROWTHS) / ((1.0 + left) ** GROWTHS - left**GROWTHS)
-    found = np.divide(half, whole, out=np.full_like(whole, ratio[-1]), where=whole > 0.0)
-    return np.interp(found, ratio[::-1], GROWTHS[::-1])
+    power = GROWTHS[:, None]
+    ratio = ((0.25 + left) ** power - left**power) / ((1.0 + left) ** power - left**power)
+    found = np.divide(half, whole, out=ratio[-1].copy(), where=whole > 0.0)
+    return np.array(
+        [np.interp(f, r[::-1], GROWTHS[::-1]) for f, r in zip(found, ratio.T, strict=True)]
+    )
 
 
 def _tops(heights: Array) -> Array:
@@ -259,6 +287,7 @@ def choose(heights: Array, noise: Array) -> Estimate:
     By Stein's unbiased estimate of the squared error (Annals of Statistics 9, 1981).
     """
     variance = np.mean(noise**2, axis=0)
+    variance = np.maximum(variance, LEAST_VARIANCE * variance.mean())
 
     def error(way: Estimate) -> float:
         surface, left = way(heights)

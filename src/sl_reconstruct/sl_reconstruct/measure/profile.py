@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sl_projector.documents import written_atomically
 from sl_projector.errors import ConfigError, StackError
 from sl_reconstruct.measure.denoise import peak_to_valley
-from sl_reconstruct.measure.region import Region, select
+from sl_reconstruct.measure.region import Region, Selection, select
 from sl_reconstruct.measure.result import SIGNIFICANT, Measurement
 
 Array = NDArray[np.float64]
@@ -21,6 +21,10 @@ Array = NDArray[np.float64]
 BINS = 500
 #: A bin's scatter is measured where it holds so many points; below, only stated sigmas count.
 SCATTER_POINTS = 5
+#: The surface's tilt is taken from so many points.
+TILT_POINTS = 30
+#: Points are as good as in line when so little of their spread is left across it.
+IN_LINE = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +36,7 @@ class ProfileMeasurement(Measurement):
     from_m, to_m : tuple of float
         Ends of the line in x, y, metres.
     along_m, z_m, u_z_m : ndarray, (n,)
-        Distance from the first end, mean height, and its standard uncertainty, metres.
+        Distance from the first end, mean height on the line, and its standard uncertainty, metres.
     """
 
     from_m: tuple[float, float]
@@ -51,7 +55,7 @@ def measure_profile(
     width_m: float,
     step_m: float | None = None,
 ) -> ProfileMeasurement:
-    """Average the points beside a line in bins along it.
+    """Average the points beside a line in bins along it, a tilt across the line taken out.
 
     Parameters
     ----------
@@ -82,18 +86,13 @@ def measure_profile(
     chosen = select(points, region)
     step = length / BINS if step_m is None else step_m
     bins = max(1, round(length / step))
-    along = (chosen.xyz_m[:, :2] - start) @ ahead
-    number = np.clip((along / length * bins).astype(np.int64), 0, bins - 1)
-    count = np.bincount(number, minlength=bins)
-    there = count > 0
-    share = 1.0 / np.maximum(count, 1)
-    z, s = (np.bincount(number, v, bins) * share for v in (chosen.xyz_m[:, 2], along))
-    u = _uncertainty(chosen.xyz_m[:, 2] - z[number], chosen.sigma_m, number, count)
-    z, s, u = z[there], s[there], u[there]
+    local = (chosen.xyz_m[:, :2] - start) @ np.array([ahead, [-ahead[1], ahead[0]]]).T
+    number = np.clip((local[:, 0] / length * bins).astype(np.int64), 0, bins - 1)
+    s, z, u = _means(local, chosen, number, bins)
     if len(z) < 2:
         raise StackError("a section needs at least two bins with points; expected a longer line")
     total = peak_to_valley(z, u, np.isfinite(z))
-    residual = chosen.xyz_m[:, 2] - np.interp(along, s, z)
+    residual = chosen.xyz_m[:, 2] - np.interp(local[:, 0], s, z)
     return ProfileMeasurement(
         kind="profile", value=total.value, uncertainty=total.uncertainty, unit="m",
         points=len(chosen), set_aside=0, rms_m=float(np.sqrt(np.mean(residual**2))),
@@ -102,21 +101,59 @@ def measure_profile(
     )  # fmt: skip
 
 
-def _uncertainty(
-    residual_m: Array, sigma_m: Array, number: NDArray[np.int64], count: NDArray[np.int64]
-) -> Array:
-    """Of each bin's mean: from the stated sigmas, or the scatter where it is clearly more.
+def _means(
+    local_m: Array, chosen: Selection, number: NDArray[np.int64], bins: int
+) -> tuple[Array, Array, Array]:
+    """Mean place along the line, height on the line and its uncertainty, of bins with points.
+
+    The surface's tilt is no scatter, and would shift the mean where points lie more on one side of
+    the line. Along the line each bin has its own, across it so many bins as hold enough points
+    have one together.
+    """
+    count = np.bincount(number, minlength=bins)
+    share = 1.0 / np.maximum(count, 1)
+    parts = np.stack([*local_m.T, chosen.xyz_m[:, 2]])
+    means = np.stack([np.bincount(number, part, bins) * share for part in parts])
+    along, *rest = parts - means[:, number]
+    length2 = np.bincount(number, along**2, bins)
+    aside, above = (part - _slope(along, part, length2, number)[number] * along for part in rest)
+    group = np.arange(bins) // int(np.ceil(TILT_POINTS / count[count > 0].mean()))
+    of = group[number]
+    spread = np.bincount(of, aside**2)
+    known = spread > IN_LINE * np.bincount(of, rest[0] ** 2)
+    tilt = np.where(known, _slope(aside, above, spread, of), 0.0)
+    held = np.bincount(group, count)[group]
+    free = count - 1.0 - (length2 > 0.0) - count / np.maximum(held, 1)
+    variance = _variance(above - tilt[of] * aside, chosen.sigma_m, number, count, free)
+    s, w, z = means
+    u = np.sqrt(variance * (share + w**2 / np.where(known, spread, np.inf)[group]))
+    there = count > 0
+    return s[there], (z - tilt[group] * w)[there], u[there]
+
+
+def _slope(x: Array, y: Array, squares: NDArray[Any], number: NDArray[np.int64]) -> Array:
+    """Of y over x in each bin, both without their means; 0 where all x are the same."""
+    products = np.bincount(number, x * y, len(squares))
+    slopes = np.zeros(len(squares))
+    np.divide(products, squares, out=slopes, where=squares > 0.0)
+    return slopes
+
+
+def _variance(
+    residual_m: Array, sigma_m: Array, number: NDArray[np.int64], count: NDArray[np.int64],
+    free: Array,
+) -> Array:  # fmt: skip
+    """Of each bin's points: as stated, or their scatter where it is clearly more.
 
     Whichever is more would be too much: the scatter of few points is by chance.
     """
     bins = len(count)
-    n = np.maximum(count, 1)
-    stated = np.bincount(number, sigma_m**2, bins) / n
-    scatter = np.bincount(number, residual_m**2, bins) / np.maximum(count - 1, 1)
-    more = scatter > stated * (1.0 + SIGNIFICANT * np.sqrt(2.0 / np.maximum(count - 1, 1)))
+    free = np.maximum(free, 1.0)
+    stated = np.bincount(number, sigma_m**2, bins) / np.maximum(count, 1)
+    scatter = np.bincount(number, residual_m**2, bins) / free
+    more = scatter > stated * (1.0 + SIGNIFICANT * np.sqrt(2.0 / free))
     trusted = (count >= SCATTER_POINTS) | (stated == 0.0)
-    variance = np.where(trusted & more, scatter, stated)
-    return np.asarray(np.sqrt(variance / n))
+    return np.asarray(np.where(trusted & more, scatter, stated))
 
 
 def save_profile(path: str | Path, profile: ProfileMeasurement) -> None:
