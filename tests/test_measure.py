@@ -222,6 +222,20 @@ def test_a_section_is_of_the_line_and_a_tilt_is_no_scatter() -> None:
     assert np.all(np.abs(wrong) < 4.5 * m.u_z_m)
 
 
+def test_what_a_bend_adds_to_sigma_is_not_drawn_as_noise() -> None:
+    """Four bins of forty state 30 times the sigma, as beside a bend, and err no more than others.
+
+    Drawn as noise they would be the highest and the lowest: some 2 x 1.7 x 30 / sqrt(15) of the
+    others' sigma, 8 um, would be taken off of a section without any height.
+    """
+    points = cloud(lambda x, y: 0.0 * x, (60, 100))
+    points["sigma"][np.abs(points["x"] - 0.5e-3) < 0.1e-3] *= 30.0
+    m = measure_profile(points, (-1e-3, 0.0), (1e-3, 0.0), 0.4e-3, 5e-5)
+    assert abs(m.value) < 2.0 * m.uncertainty
+    # Three times the others' sigma is drawn: 1.7 x 3 x 0.37 um / sqrt(8) for either extreme.
+    assert m.uncertainty < 2.0 * SIGMA_M
+
+
 @pytest.mark.parametrize("half", [0.0, 2e-6])
 def test_extremes_without_noise_are_exact(half) -> None:
     """No sigma is stated, and points of a bin do not scatter."""

@@ -36,6 +36,8 @@ DRAWS, FEW, REPEATS = 100, 16, 120
 GROWTHS = np.linspace(0.5, 1.0, 51)
 #: Heights with noise at once: bounds memory.
 AT_ONCE = 2_000_000
+#: What a standard deviation has beyond so many times the median one is no noise.
+OUTLYING = 3.0
 #: A place without noise counts as one with so little of the mean variance.
 LEAST_VARIANCE = 1e-6
 #: Of the polynomial that is taken out before cosines.
@@ -81,6 +83,27 @@ def take_off(raw: float, clean: float, drawn: Array, squares: bool = False) -> C
     return Corrected(value, float(again.std(ddof=1)))
 
 
+def noise_part(sd: Array) -> Array:
+    """What of standard deviations is noise.
+
+    Beside bends and uneven light a point's sigma is far above the others', by errors that are the
+    same each time (``sl_reconstruct.bends``). Drawn as noise they would raise extremes which no
+    measured height has.
+
+    Parameters
+    ----------
+    sd : ndarray, any shape
+        Standard deviations; NaN where there is none.
+
+    Returns
+    -------
+    ndarray
+        At most three times the median of those that are not 0.
+    """
+    some = sd[sd > 0.0]
+    return np.asarray(np.minimum(sd, OUTLYING * np.median(some)) if some.size else sd)
+
+
 def peak_to_valley(heights: Array, noise_sd: Array, there: Mask) -> Corrected:
     """Highest less lowest of a surface of which noisy heights are known.
 
@@ -100,12 +123,13 @@ def peak_to_valley(heights: Array, noise_sd: Array, there: Mask) -> Corrected:
     if not np.any(noise_sd[there]):
         return Corrected(float(np.ptp(heights[there])), 0.0)
     filled, sd = (fill(np.where(there, a, np.nan)) for a in (heights, noise_sd))
-    noise = sd * np.random.default_rng(0).standard_normal((DRAWS, *sd.shape))
-    return extremes(filled, noise, choose(filled, noise), there)[2]
+    part = noise_part(sd)
+    noise = part * np.random.default_rng(0).standard_normal((DRAWS, *sd.shape))
+    return extremes(filled, noise, choose(filled, noise), there, np.sqrt(sd**2 - part**2))[2]
 
 
 def extremes(
-    heights: Array, noise: Array, estimate: Estimate, there: Mask
+    heights: Array, noise: Array, estimate: Estimate, there: Mask, beyond: Array
 ) -> tuple[Corrected, Corrected, Corrected]:
     """Highest, minus the lowest, and highest less lowest height, less what noise adds.
 
@@ -119,6 +143,9 @@ def extremes(
         Surface without noise.
     there : ndarray of bool
         Where heights count.
+    beyond : ndarray, any shape
+        Standard deviations of what is not noise: of the places that are the highest and the
+        lowest they go into the uncertainty.
 
     Notes
     -----
@@ -149,7 +176,8 @@ def extremes(
     values = corrected(heights)
     some = noise[: REPEATS // 2]
     repeated = np.stack([corrected(clean + draw) for draw in (*some, *-some)])
-    spread = repeated.std(axis=0, ddof=1)
+    own = [beyond[there][pick(heights[there])] ** 2 for pick in (np.argmax, np.argmin)]
+    spread = np.sqrt(repeated.var(axis=0, ddof=1) + np.array([*own, sum(own)]))
     peak, valley, total = map(Corrected, values.tolist(), spread.tolist())
     return peak, valley, total
 

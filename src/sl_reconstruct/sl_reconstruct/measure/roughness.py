@@ -19,6 +19,7 @@ from sl_reconstruct.measure.denoise import (
     Waves,
     extremes,
     fill,
+    noise_part,
     take_off,
 )
 from sl_reconstruct.measure.region import Region
@@ -199,7 +200,9 @@ def _corrected(
     sigma = points["sigma"] if "sigma" in names else np.zeros(points.shape, np.float32)
     if not np.nanmax(np.where(np.isfinite(points["z"]), sigma, 0.0), initial=0.0) > 0.0:
         return {name: Corrected(value, float("nan")) for name, value in raw.items()}
-    noise = _noise_maps(points, sigma, height)
+    part = noise_part(np.where(np.isfinite(points["z"]), sigma, np.nan))
+    noise = _noise_maps(points, part, height)
+    beyond = _map_of(points, np.sqrt(sigma**2 - part**2), height)
     inner = _levelled(fill(_without_border(np.asarray(height.z_m, dtype=np.float64))))
     estimate = Waves(noise)
     clean = estimate(inner)[0]
@@ -212,7 +215,7 @@ def _corrected(
     }  # fmt: skip
     # Highest and lowest of levelled heights are Sp and Sv themselves.
     level = np.stack([_levelled(draw) for draw in noise])
-    tops = extremes(inner, level, estimate, np.ones(inner.shape, np.bool_))
+    tops = extremes(inner, level, estimate, np.ones(inner.shape, np.bool_), beyond)
     return found | dict(zip(EXTREMES, tops, strict=True)) | _shapes(raw, found, noise)
 
 
@@ -238,14 +241,17 @@ def _shapes(
 def _noise_maps(points: NDArray[Any], sigma: NDArray[Any], height: HeightMap) -> Array:
     """Draws of the points' noise alone, (n, rows, columns) of the map without its border."""
     rng = np.random.default_rng(0)
-    alone = points.copy()
-    maps = []
-    for _ in range(int(np.clip(HEIGHTS / height.z_m.size, DRAWS, MANY))):
-        noise = sigma * rng.standard_normal(points.shape, np.float32)
-        alone["z"] = np.where(np.isfinite(points["z"]), noise, np.nan)
-        z = make_height_map(alone, height.step_m).z_m
-        maps.append(fill(_without_border(np.asarray(z, dtype=np.float64))))
-    return np.stack(maps)
+    draws = int(np.clip(HEIGHTS / height.z_m.size, DRAWS, MANY))
+    normal = (rng.standard_normal(points.shape, np.float32) for _ in range(draws))
+    return np.stack([_map_of(points, sigma * draw, height) for draw in normal])
+
+
+def _map_of(points: NDArray[Any], values: NDArray[Any], height: HeightMap) -> Array:
+    """Values of points instead of their heights, on the map's nodes without its border."""
+    other = points.copy()
+    other["z"] = np.where(np.isfinite(points["z"]), values, np.nan)
+    z = make_height_map(other, height.step_m).z_m
+    return fill(_without_border(np.asarray(z, dtype=np.float64)))
 
 
 def _levelled(z: Array) -> Array:
