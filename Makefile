@@ -26,7 +26,7 @@ scan: venv ## install, start bench and graph, calibrate, scan the V-groove, show
 	@$(BIN)/slrig scan --up --bench --calibrate --surface groove --measure groove --output $(OUTPUT)/groove
 
 test: venv ## install, run all tests
-	@$(PYTEST) -n 2 --dist loadgroup
+	@$(PYTEST) -n 2 --dist loadfile
 
 check: venv ## style, types, import directions: under a minute
 	@$(BIN)/ruff check .

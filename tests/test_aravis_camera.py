@@ -22,8 +22,6 @@ from sl_camera.aravis_library import list_cameras, load_aravis
 from sl_camera.camera import CameraDriver, CameraSettings, Frame, FrameStatus
 from sl_projector.errors import DeviceError, DeviceLost, DeviceRefused
 
-# GigE Vision has one port on a machine.
-pytestmark = pytest.mark.xdist_group("gige")
 EXPOSURE_S = 0.003
 MIRRORS = np.ones((2, 2), np.bool_)
 SMALL = CameraSettings(exposure_s=EXPOSURE_S, trigger="software", region=(0, 0, 64, 48))

@@ -27,11 +27,7 @@ CLOCK_NS = 5_000_000
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     asked = metafunc.config.getoption("--hardware")
     kinds = [*KINDS, *(kind for kind in asked if kind.startswith(HARDWARE))]
-    # GigE Vision has one port on a machine: its tests follow each other.
-    marks = {kind: [pytest.mark.xdist_group("gige")] for kind in ("aravis", "gige")}
-    metafunc.parametrize(
-        "made", [pytest.param(k, marks=marks.get(k, [])) for k in kinds], indirect=True
-    )
+    metafunc.parametrize("made", kinds, indirect=True)
 
 
 @pytest.fixture

@@ -39,7 +39,6 @@ from sl_projector.dmd import Timing  # noqa: E402
 from sl_projector.messages import stamp_from_msg, stamp_to_msg  # noqa: E402
 from sl_projector.sequence import named  # noqa: E402
 
-pytestmark = pytest.mark.xdist_group("gige")
 PAPER = named("paper")
 TIMING = Timing(0.034)
 EXPOSURE_S = 0.033

@@ -39,8 +39,6 @@ from sl_projector.base_node import EVENTS, LARGE  # noqa: E402
 from sl_reconstruct.reconstruct_node import ReconstructNode  # noqa: E402
 from test_slrig_graph import READY_PATIENCE_S, Command  # noqa: E402
 
-pytestmark = pytest.mark.xdist_group("graph")
-
 SCANS = 2
 #: Nothing is calibrated here.
 OF_SCANS = [topic for topic in RECORDED_TOPICS if topic is not CALIBRATION_RUN]

@@ -25,8 +25,6 @@ SLRIG = (sys.executable, "-m", "sl_bringup.cli")
 #: The first start on a machine compiles for a minute or two.
 READY_PATIENCE_S = 280.0
 
-pytestmark = pytest.mark.xdist_group("graph")
-
 
 class Command:
     """A running ``slrig`` whose output is collected."""
