@@ -10,7 +10,7 @@ PYTHON := $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	&& echo $$p && break; done)
 PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
 INTERFACES := $(shell find src/sl_interfaces -type f)
-PACKAGES := sl_projector sl_camera sl_reconstruct sl_calibration sl_bench sl_bringup
+PACKAGES := sl_common sl_projector sl_camera sl_reconstruct sl_calibration sl_bench sl_bringup
 SOURCES := $(foreach p,$(PACKAGES),src/$(p)/$(p))
 PYTEST := $(BIN)/python -m pytest
 
@@ -32,10 +32,10 @@ check: venv ## style, types, import directions: under a minute
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy $(SOURCES)
-	@$(PYTEST) -q tests/test_architecture.py
+	@$(PYTEST) -q tests/common/test_architecture.py
 
 paper: venv ## the paper's Table 2 and Figs. 10 and 11 on the bench, beside the paper's numbers
-	@$(BIN)/python -m sl_bringup.paper --output $(OUTPUT)/paper
+	@$(BIN)/python -m sl_bringup.results.paper --output $(OUTPUT)/paper
 
 bench: venv ## speed and memory
 	@set -e; for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b; done

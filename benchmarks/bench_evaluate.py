@@ -13,16 +13,16 @@ import tempfile
 import time
 from pathlib import Path
 
-from sl_bench.optics import Optics
-from sl_bench.reference import reference_rig
-from sl_bench.surfaces import make_surface
-from sl_bench.world import World
-from sl_bringup.bag_writer import new_bag
-from sl_bringup.bags import TOPICS, open_bag, typestore
-from sl_bringup.evaluation import Choices, Crew, evaluate_bag
-from sl_bringup.mcap_writer import McapWriter
-from sl_projector.sequence import named
-from sl_reconstruct.calibration_file import Calibration
+from sl_bench.world.optics import Optics
+from sl_bench.world.reference_rig import reference_rig
+from sl_bench.world.surfaces import make_surface
+from sl_bench.world.world import World
+from sl_bringup.bag.bag_writer import new_bag
+from sl_bringup.bag.bags import TOPICS, open_bag, typestore
+from sl_bringup.bag.mcap_writer import McapWriter
+from sl_bringup.evaluation.evaluation import Choices, Crew, evaluate_bag
+from sl_projector.sequence.pattern_sequence import named
+from sl_reconstruct.model.calibration_file import Calibration
 
 SCANS = 12
 START_NS, FRAME_NS, SCAN_NS = 1_700_000_000_000_000_000, 20_000_000, 2_000_000_000

@@ -19,7 +19,7 @@ import threading
 import time
 from typing import Any
 
-from sl_bringup.graph import Graph, GraphOptions, is_running
+from sl_bringup.graph.graph import Graph, GraphOptions, is_running
 
 
 class Caller:
@@ -31,7 +31,7 @@ class Caller:
         from sl_interfaces.msg import PatternTrigger
         from sl_interfaces.srv import Project, Scan
 
-        from sl_projector.base_node import EVENTS
+        from sl_common.base_node import EVENTS
 
         rclpy.init()
         self._sequence = sequence

@@ -17,13 +17,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sl_bench.optics import Optics
-from sl_bench.reference import reference_rig
-from sl_bench.surfaces import make_surface
-from sl_bench.world import World
-from sl_projector.sequence import named
-from sl_reconstruct.reconstruct import Reconstructor
-from sl_reconstruct.settings import Settings
+from sl_bench.world.optics import Optics
+from sl_bench.world.reference_rig import reference_rig
+from sl_bench.world.surfaces import make_surface
+from sl_bench.world.world import World
+from sl_projector.sequence.pattern_sequence import named
+from sl_reconstruct.decode.settings import Settings
+from sl_reconstruct.reconstruction.reconstructor import Reconstructor
 
 EXPOSURE_S = 1.0 / 30.0
 REPEATS = 25

@@ -14,11 +14,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sl_bench.optics import Optics
-from sl_bench.reference import reference_rig
-from sl_bench.surfaces import make_surface
-from sl_bench.world import World
-from sl_projector.sequence import Pattern, precise
+from sl_bench.world.optics import Optics
+from sl_bench.world.reference_rig import reference_rig
+from sl_bench.world.surfaces import make_surface
+from sl_bench.world.world import World
+from sl_projector.sequence.pattern_sequence import Pattern, precise
 
 EXPOSURE_S = 1.0 / 30.0
 DMD = (1024, 768)

@@ -15,17 +15,17 @@ import numpy as np
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 
-from sl_bench.optics import Optics
-from sl_bench.reference import reference_rig
-from sl_bench.surfaces import make_surface
-from sl_bench.world import World
-from sl_projector.sequence import named
+from sl_bench.world.optics import Optics
+from sl_bench.world.reference_rig import reference_rig
+from sl_bench.world.surfaces import make_surface
+from sl_bench.world.world import World
+from sl_projector.sequence.pattern_sequence import named
 from sl_reconstruct.measure.groove import measure_groove
 from sl_reconstruct.measure.region import Region, Selection, select
-from sl_reconstruct.measure.rounds import measure_sphere
+from sl_reconstruct.measure.sphere_cylinder import measure_sphere
 from sl_reconstruct.measure.step import measure_step
-from sl_reconstruct.reconstruct import Reconstructor
-from uncertainty_scenes import SCENES, z_scores
+from sl_reconstruct.reconstruction.reconstructor import Reconstructor
+from support.uncertainty_scenes import SCENES, z_scores
 
 EXPOSURE_S = 1.0 / 30.0
 POSES = 10

@@ -33,13 +33,13 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sl_bench.bench_control import BenchControl
-from sl_bench.reference import reference_rig
-from sl_bench.true_rig import write_rig
-from sl_bringup.graph import GraphOptions
-from sl_bringup.graph_config import find_config
-from sl_bringup.transport import process_environment
-from sl_projector.sequence import named
+from sl_bench.process.bench_control import BenchControl
+from sl_bench.world.reference_rig import reference_rig
+from sl_bench.world.true_rig import write_rig
+from sl_bringup.graph.graph import GraphOptions
+from sl_bringup.graph.graph_config import find_config
+from sl_bringup.graph.transport import process_environment
+from sl_projector.sequence.pattern_sequence import named
 
 NODES = ("projector", "camera", "stage", "synchronizer", "calibration", "reconstruct")
 READY_S = 900.0
@@ -199,7 +199,7 @@ class Client:
         from sl_interfaces.srv import MoveStage, Scan
         from std_srvs.srv import Trigger
 
-        from sl_projector.base_node import EVENTS, LARGE
+        from sl_common.base_node import EVENTS, LARGE
 
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self._node = rclpy.create_node("soak", namespace="sl")
@@ -530,7 +530,7 @@ def write_config(options: GraphOptions, rows: int) -> Path:
 
 def start_graph(options: GraphOptions, log: Path) -> subprocess.Popen[bytes]:
     """Start ``slrig up`` and wait until it is ready."""
-    command = [sys.executable, "-m", "sl_bringup.cli", "up", "--bench"]
+    command = [sys.executable, "-m", "sl_bringup.cli.main", "up", "--bench"]
     command += ["--domain", str(options.domain)]
     command += ["--config", str(options.config)] if options.config else []
     environment = process_environment({"PYTHONPATH": os.pathsep.join(sys.path)})

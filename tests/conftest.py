@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from domains import ReservedDomain
-from sl_bringup.transport import Transport
+from sl_bringup.graph.transport import Transport
+from support.domains import ReservedDomain
 
 ROOT = Path(__file__).resolve().parents[1]
 

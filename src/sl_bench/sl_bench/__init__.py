@@ -4,7 +4,3 @@ Knows: rig and surface as a world that says how much light each camera pixel get
 chain, and the devices at their byte seams. Must not know: decoder and triangulation, since an
 error shared with them would cancel. Emulators share the world, not each other.
 """
-
-from sl_projector import kernel_cache
-
-kernel_cache.choose()

@@ -12,10 +12,10 @@ from rclpy.action import ActionClient
 from sl_interfaces.action import Calibrate
 from sl_interfaces.srv import Verify
 
-from sl_bringup.calibrate import outcome_lines
+from sl_bringup.cli.calibrate import outcome_lines
 from sl_bringup.client_node import GraphClient, run_client
-from sl_bringup.paper_tables import table_1_lines
-from sl_bringup.progress import say
+from sl_bringup.graph.console import say
+from sl_bringup.results.paper_tables import table_1_lines
 
 
 class CalibrateClient(GraphClient):

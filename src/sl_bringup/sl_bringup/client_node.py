@@ -12,8 +12,8 @@ import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from sl_bringup.progress import complain
-from sl_projector.errors import DeviceLost, DeviceTimeout, SlError
+from sl_bringup.graph.console import complain
+from sl_common.errors import DeviceLost, DeviceTimeout, SlError
 
 INTERRUPTED = 130
 #: A cancelled goal ends when stage and projector have stopped.

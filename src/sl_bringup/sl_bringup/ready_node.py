@@ -11,7 +11,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
-from sl_bringup.progress import complain, say
+from sl_bringup.graph.console import complain, say
 
 SERVICES = (
     "projector/project", "stage/move", "stage/home", "scan", "scan/_action/send_goal", "measure",

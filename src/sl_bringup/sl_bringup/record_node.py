@@ -19,12 +19,12 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from sl_bringup.bag_recorder import BagRecorder
-from sl_bringup.bag_writer import topic_qos
-from sl_bringup.bags import IMAGE, RECORDED_TOPICS, TOPICS, TRIGGER, Topic
-from sl_bringup.progress import StatusLine, complain, say
-from sl_bringup.version import software_version
-from sl_projector.errors import BagError, SlError
+from sl_bringup.bag.bag_recorder import BagRecorder
+from sl_bringup.bag.bag_writer import topic_qos
+from sl_bringup.bag.bags import IMAGE, RECORDED_TOPICS, TOPICS, TRIGGER, Topic
+from sl_bringup.graph.console import StatusLine, complain, say
+from sl_bringup.graph.version import software_version
+from sl_common.errors import BagError, SlError
 
 #: Messages that may wait while the disk does: two seconds of images at 100 Hz.
 DEPTH = 256

@@ -14,11 +14,11 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
-from sl_bringup.bags import RAW_TOPICS, RECORDED_TOPICS, Bag, Raw, Topic, open_bag
-from sl_bringup.progress import StatusLine, complain, say
+from sl_bringup.bag.bags import RAW_TOPICS, RECORDED_TOPICS, Bag, Raw, Topic, open_bag
+from sl_bringup.graph.console import StatusLine, complain, say
 from sl_bringup.record_node import message_type
-from sl_projector.errors import BagError, SlError
-from sl_projector.messages import stamp_to_msg
+from sl_common.errors import BagError, SlError
+from sl_projector.sequence.messages import stamp_to_msg
 
 #: A whole sequence waits for a busy listener.
 DEPTH = 64

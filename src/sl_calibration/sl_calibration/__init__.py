@@ -2,7 +2,3 @@
 
 Must not know: devices, ROS topics, the bench. Imports `sl_projector` and `sl_reconstruct`.
 """
-
-from sl_projector import kernel_cache
-
-kernel_cache.choose()

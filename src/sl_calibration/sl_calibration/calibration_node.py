@@ -21,16 +21,16 @@ from sl_interfaces.msg import RigCalibration
 from sl_interfaces.srv import Calibrate, Verify
 from std_msgs.msg import String
 
-from sl_calibration.calibrator import Calibrator, InForce, Pitches, VerifyOutcome
-from sl_calibration.conclude import Outcome
-from sl_calibration.gear_node import RigGear
-from sl_calibration.plate import DEFAULT_PLATE, Plate
-from sl_calibration.session import Order, Progress
-from sl_calibration.store import Store, default_directory
-from sl_calibration.uncertainty import Limits
-from sl_calibration.verify import VerifyLimits
-from sl_calibration.warm_up import warm_up_apart
-from sl_projector.base_node import (
+from sl_calibration.acquisition_node import GraphDevices
+from sl_calibration.data.run_store import Store, default_directory
+from sl_calibration.data.session import CalibrationProgress, CalibrationRequest
+from sl_calibration.solve.uncertainty import Limits
+from sl_calibration.target.plate import DEFAULT_PLATE, Plate
+from sl_calibration.verify.verification import VerifyLimits
+from sl_calibration.workflow.calibrator import Calibrator, InForce, Pitches, VerifyOutcome
+from sl_calibration.workflow.conclude import Outcome
+from sl_calibration.workflow.warm_up import warm_up_apart
+from sl_common.base_node import (
     CAMERA_FRAME,
     EVENTS,
     LATCHED,
@@ -40,11 +40,11 @@ from sl_projector.base_node import (
     RigNode,
     run,
 )
-from sl_projector.errors import CalibrationError, SlError
-from sl_projector.messages import stamp_from_msg
-from sl_reconstruct.calibration_file import Calibration, load_calibration, parse_calibration
+from sl_common.errors import CalibrationError, SlError
+from sl_projector.sequence.messages import stamp_from_msg
 from sl_reconstruct.messages import rig_to_msg
-from sl_reconstruct.scan_flow import ScanTimeouts
+from sl_reconstruct.model.calibration_file import Calibration, load_calibration, parse_calibration
+from sl_reconstruct.scan.scan_flow import ScanTimeouts
 
 _LimitsT = TypeVar("_LimitsT", Limits, VerifyLimits)
 
@@ -59,7 +59,7 @@ class CalibrationNode(RigNode):
         super().__init__("calibration", **options)
         self._declare_parameters()
         self._calibrator = self._make_calibrator()
-        self._gear = RigGear(self)
+        self._gear = GraphDevices(self)
         self._gear.timeouts = self._timeouts
         self._gear.max_repeats = self._repeats
         self._gear.move_timeout_s = self._move_timeout_s
@@ -239,7 +239,7 @@ class CalibrationNode(RigNode):
         return fill(response, outcome)
 
     async def _execute(self, goal: Any) -> Any:
-        def tell(progress: Progress) -> None:
+        def tell(progress: CalibrationProgress) -> None:
             goal.publish_feedback(_feedback(progress))
 
         def cancelled() -> bool:
@@ -258,7 +258,10 @@ class CalibrationNode(RigNode):
         return not self.context.ok()
 
     def _calibrate(
-        self, request: Any, tell: Callable[[Progress], None], cancelled: Callable[[], bool]
+        self,
+        request: Any,
+        tell: Callable[[CalibrationProgress], None],
+        cancelled: Callable[[], bool],
     ) -> Outcome:
         def work() -> Outcome:
             order = self._order(request)
@@ -298,11 +301,13 @@ class CalibrationNode(RigNode):
         self.say(outcome.message)
         return outcome
 
-    def _order(self, request: Any) -> Order:
+    def _order(self, request: Any) -> CalibrationRequest:
         heights = [float(h) for h in request.heights_m] or list(self._value("heights_m"))
         plate = self._plate(request)
         sequence = request.sequence or str(self._value("sequence"))
-        return Order(request.target or "both", tuple(heights), plate, sequence, self._travel_m)
+        return CalibrationRequest(
+            request.target or "both", tuple(heights), plate, sequence, self._travel_m
+        )
 
     def _plate(self, request: Any = None) -> Plate:
         """Plate of the parameters; what a request names is the request's."""
@@ -362,7 +367,7 @@ def fill(response: Any, outcome: Outcome) -> Any:
     return response
 
 
-def _feedback(progress: Progress) -> Any:
+def _feedback(progress: CalibrationProgress) -> Any:
     return CalibrateAction.Feedback(
         stage=progress.stage,
         view=progress.view,

@@ -16,8 +16,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from sl_interfaces.msg import PatternTrigger, RigCalibration
 from std_srvs.srv import Trigger
 
-from sl_camera.aravis_camera import AravisOptions
-from sl_camera.camera import (
+from sl_camera.camera.camera import (
     PIXEL_BITS,
     TRIGGER_MODES,
     CameraDriver,
@@ -26,11 +25,12 @@ from sl_camera.camera import (
     Frame,
     FrameStatus,
 )
-from sl_camera.camera_drivers import ADDRESSES, make_camera
+from sl_camera.camera.software_trigger import PatternWindows
+from sl_camera.drivers.aravis_camera import AravisOptions
+from sl_camera.drivers.camera_drivers import ADDRESSES, make_camera
+from sl_camera.drivers.uvc_camera import UvcOptions
 from sl_camera.messages import camera_info_for, image_to_msg
-from sl_camera.software_trigger import PatternWindows
-from sl_camera.uvc_camera import UvcOptions
-from sl_projector.base_node import (
+from sl_common.base_node import (
     CAMERA_FRAME,
     EVENTS,
     IMAGES,
@@ -40,9 +40,9 @@ from sl_projector.base_node import (
     device_health,
     run,
 )
-from sl_projector.device_link import DeviceLink
-from sl_projector.errors import DeviceError, DeviceRefused, SlError
-from sl_projector.messages import stamp_from_msg
+from sl_common.device_link import DeviceLink
+from sl_common.errors import DeviceError, DeviceRefused, SlError
+from sl_projector.sequence.messages import stamp_from_msg
 
 READ_TIMEOUT_S = 0.1
 SETTING_TIMEOUT_S = 3.0

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 from sl_interfaces.msg import MatchedFrame, PatternStack
 
-from sl_camera.match_events import PIXEL_TYPES, FrameDecision, MatchedStack, PoseEvent
-from sl_camera.stage import Position
-from sl_projector.messages import pattern_to_msg, stamp_to_msg
+from sl_camera.stage.stage import Position
+from sl_camera.sync.match_events import PIXEL_TYPES, FrameDecision, MatchedStack, PoseEvent
+from sl_projector.sequence.messages import pattern_to_msg, stamp_to_msg
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 

@@ -12,14 +12,14 @@ from geometry_msgs.msg import PoseStamped
 from sl_interfaces.srv import MoveStage
 from std_srvs.srv import Trigger
 
-from sl_camera.grbl import GrblStage
-from sl_camera.manual_stage import ManualStage
 from sl_camera.messages import stage_pose
-from sl_camera.stage import Position, StageDriver, StageState
-from sl_camera.zaber import ZaberStage, zaber_axes
-from sl_projector.base_node import EVENTS, WORLD_FRAME, Health, RigNode, run
-from sl_projector.device_link import DeviceLink
-from sl_projector.errors import (
+from sl_camera.stage.grbl.grbl_stage import GrblStage
+from sl_camera.stage.manual_stage import ManualStage
+from sl_camera.stage.stage import Position, StageDriver, StageState
+from sl_camera.stage.zaber.zaber_stage import ZaberStage, zaber_axes
+from sl_common.base_node import EVENTS, WORLD_FRAME, Health, RigNode, run
+from sl_common.device_link import DeviceLink
+from sl_common.errors import (
     ConfigError,
     DeviceError,
     DeviceLost,

@@ -9,11 +9,11 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import Image
 from sl_interfaces.msg import MatchedFrame, PatternStack, PatternTrigger
 
-from sl_camera.match_events import FrameDecision, MatchedStack, MatcherSettings, Status
-from sl_camera.matching import StackMatcher
-from sl_camera.message_fields import image_event, pose_event, trigger_event
 from sl_camera.messages import decision_to_msg, stack_to_msg
-from sl_projector.base_node import CAMERA_FRAME, EVENTS, IMAGES, LARGE, Health, RigNode, run
+from sl_camera.sync.match_events import FrameDecision, MatchedStack, MatcherSettings, Status
+from sl_camera.sync.matching import StackMatcher
+from sl_camera.sync.message_fields import image_event, pose_event, trigger_event
+from sl_common.base_node import CAMERA_FRAME, EVENTS, IMAGES, LARGE, Health, RigNode, run
 
 #: While a scan is open, time-outs and the settling time are looked at so often.
 TICK_S = 0.004

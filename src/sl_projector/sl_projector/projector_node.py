@@ -13,7 +13,7 @@ from sl_interfaces.msg import PatternTrigger, RigCalibration
 from sl_interfaces.srv import Project
 from std_srvs.srv import Trigger
 
-from sl_projector.base_node import (
+from sl_common.base_node import (
     EVENTS,
     LATCHED,
     PROJECTOR_FRAME,
@@ -23,10 +23,18 @@ from sl_projector.base_node import (
     next_scan_id,
     run,
 )
-from sl_projector.device_link import DeviceLink
-from sl_projector.dlpc350 import Dlpc350, Dlpc350Settings
-from sl_projector.dlpc900 import Dlpc900, Dlpc900Settings
-from sl_projector.dmd import (
+from sl_common.device_link import DeviceLink
+from sl_common.errors import (
+    ConfigError,
+    DeviceLost,
+    DeviceRefused,
+    DeviceTimeout,
+    SequenceError,
+    SlError,
+)
+from sl_projector.dlpc.dlpc350_driver import Dlpc350, Dlpc350Settings
+from sl_projector.dlpc.dlpc900_driver import Dlpc900, Dlpc900Settings
+from sl_projector.dlpc.dmd import (
     DEFAULT_MODEL,
     MODELS,
     ProjectorDriver,
@@ -36,17 +44,9 @@ from sl_projector.dmd import (
     TriggerOut,
     dmd_model,
 )
-from sl_projector.errors import (
-    ConfigError,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-    SequenceError,
-    SlError,
-)
-from sl_projector.messages import stamp_from_msg, trigger_to_msg
-from sl_projector.sequence import NAMED, PatternSequence, named
-from sl_projector.sequence_file import load_sequence
+from sl_projector.sequence.messages import stamp_from_msg, trigger_to_msg
+from sl_projector.sequence.pattern_sequence import NAMED, PatternSequence, named
+from sl_projector.sequence.sequence_file import load_sequence
 
 
 def find_in_directory(name: str, directory: str, dmd_size: tuple[int, int]) -> PatternSequence:

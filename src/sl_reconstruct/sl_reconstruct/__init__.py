@@ -4,7 +4,3 @@ Knows: the rig model (Eqs. 1-4 of Tsai & Hung 2005), decoding, sub-pixel edges a
 triangulation, clouds and their files, measurement of surfaces. Must not know: devices, how the
 images were taken, the bench. Imports data types of `sl_projector` only.
 """
-
-from sl_projector import kernel_cache
-
-kernel_cache.choose()

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from sl_interfaces.srv import Measure
 
-from sl_projector.base_node import RigNode
-from sl_projector.errors import SlError, StackError
-from sl_reconstruct.cloud_reading import read_cloud
-from sl_reconstruct.measure.order import Answer, Order, carry_out
+from sl_common.base_node import RigNode
+from sl_common.errors import SlError, StackError
+from sl_reconstruct.cloud.cloud_reader import read_cloud
+from sl_reconstruct.measure.request import Answer, MeasurementRequest, carry_out
 
 
 class _Source(NamedTuple):
@@ -66,8 +66,8 @@ class MeasureService:
         return self._last
 
 
-def _order(request: Any) -> Order:
-    return Order(
+def _order(request: Any) -> MeasurementRequest:
+    return MeasurementRequest(
         request.kind, tuple(request.region_m), request.reference_file, request.level,
         request.quantity, tuple(request.tolerance),
     )  # fmt: skip

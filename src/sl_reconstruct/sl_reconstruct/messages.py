@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from sl_interfaces.msg import PatternStack, RefusalCount, RigCalibration, ScanReport
 
-from sl_projector.errors import SequenceError, StackError
-from sl_projector.messages import sequence_from_msgs, stamp_from_msg, stamp_to_msg
-from sl_projector.sequence import PatternSequence
-from sl_reconstruct.calibration_file import Calibration, dump_calibration
-from sl_reconstruct.cloud_files import cloud_hash
-from sl_reconstruct.plumb_bob import plumb_bob
-from sl_reconstruct.rig import Device, Rig
-from sl_reconstruct.workshop import Product
+from sl_common.errors import SequenceError, StackError
+from sl_projector.sequence.messages import sequence_from_msgs, stamp_from_msg, stamp_to_msg
+from sl_projector.sequence.pattern_sequence import PatternSequence
+from sl_reconstruct.cloud.cloud_writer import cloud_hash
+from sl_reconstruct.model.calibration_file import Calibration, dump_calibration
+from sl_reconstruct.model.opencv_lens import plumb_bob
+from sl_reconstruct.model.rig import Device, Rig
+from sl_reconstruct.reconstruction.reconstructor_cache import Product
 
 Array = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from typing import Any
 from sl_interfaces.srv import Project
 from std_srvs.srv import Trigger
 
-from sl_projector.base_node import RigNode
-from sl_reconstruct.scan_flow import ScanFailed, ScanOrder, ScanWatch
+from sl_common.base_node import RigNode
+from sl_reconstruct.scan.scan_flow import ScanFailed, ScanRequest, ScanWatch
 
 
 class ProjectorClient:
@@ -32,7 +32,7 @@ class ProjectorClient:
             return "nobody offers projector/project: is the projector node running?"
         return ""
 
-    def project(self, watch: ScanWatch, order: ScanOrder) -> None:
+    def project(self, watch: ScanWatch, order: ScanRequest) -> None:
         """Ask the projector; the watch is told when it has answered.
 
         Raises

@@ -24,7 +24,7 @@ from sl_interfaces.action import Scan
 from sl_interfaces.msg import MatchedFrame, PatternStack, RigCalibration, ScanReport
 from sl_interfaces.srv import Scan as ScanService
 
-from sl_projector.base_node import (
+from sl_common.base_node import (
     CAMERA_FRAME,
     EVENTS,
     LARGE,
@@ -36,9 +36,9 @@ from sl_projector.base_node import (
     next_scan_id,
     run,
 )
-from sl_projector.errors import CalibrationError, ConfigError, SlError, StackError
-from sl_projector.messages import stamp_from_msg
-from sl_reconstruct.calibration_file import Calibration, load_calibration, parse_calibration
+from sl_common.errors import CalibrationError, ConfigError, SlError, StackError
+from sl_projector.sequence.messages import stamp_from_msg
+from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.measure_service_node import MeasureService
 from sl_reconstruct.messages import (
     Stack,
@@ -49,19 +49,24 @@ from sl_reconstruct.messages import (
     rig_to_msg,
     stack_from_msg,
 )
+from sl_reconstruct.model.calibration_file import Calibration, load_calibration, parse_calibration
 from sl_reconstruct.projector_client_node import ProjectorClient
-from sl_reconstruct.quality import verdict
-from sl_reconstruct.scan_flow import (
+from sl_reconstruct.reconstruction.reconstructor_cache import (
+    Workshop,
+    compile_apart,
+    compiled,
+    warm_up,
+)
+from sl_reconstruct.reconstruction.scan_quality import verdict
+from sl_reconstruct.scan.scan_flow import (
     ScanFailed,
-    ScanOrder,
     ScanProgress,
+    ScanRequest,
     ScanResult,
     ScanRun,
     ScanTimeouts,
     ScanWatch,
 )
-from sl_reconstruct.settings import Settings
-from sl_reconstruct.workshop import Workshop, compile_apart, compiled, warm_up
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -394,13 +399,13 @@ class ReconstructNode(RigNode):
             self._watch = None
             self._scanning.release()
 
-    def _order(self, request: Any) -> ScanOrder:
+    def _order(self, request: Any) -> ScanRequest:
         if not 0.0 <= request.exposure_s <= 16.0:
             raise ConfigError(f"exposure_s={request.exposure_s}; expected 0 (default) to 16 s")
         repeats = request.max_repeats
         if repeats == 255:
             repeats = int(self.get_parameter("max_repeats").value)
-        return ScanOrder(request.sequence, request.exposure_s, repeats)
+        return ScanRequest(request.sequence, request.exposure_s, repeats)
 
     def _fill(self, response: Any, result: ScanResult) -> Any:
         """Put a result into a service's response or an action's result."""
@@ -417,7 +422,7 @@ class ReconstructNode(RigNode):
             self.get_logger().error(f"scan failed: {result.message}")
         return response
 
-    # -- what a scan needs of the graph (`scan_flow.Gear`) --------------------------------------
+    # -- what a scan needs of the graph (`scan_flow.ScanDevices`) -----------------------
 
     def begin(self) -> ScanWatch:
         """Take a number that no scan had."""
@@ -444,7 +449,7 @@ class ReconstructNode(RigNode):
             )
         return ""
 
-    def project(self, watch: ScanWatch, order: ScanOrder) -> None:
+    def project(self, watch: ScanWatch, order: ScanRequest) -> None:
         """Ask the projector; the watch is told when it has answered."""
         self._projector.project(watch, order)
 

@@ -87,8 +87,8 @@ def noise_part(sd: Array) -> Array:
     """What of standard deviations is noise.
 
     Beside bends and uneven light a point's sigma is far above the others', by errors that are the
-    same each time (``sl_reconstruct.bends``). Drawn as noise they would raise extremes which no
-    measured height has.
+    same each time (``sl_reconstruct.decode.edge_uncertainty``). Drawn as noise they would raise
+    extremes which no measured height has.
 
     Parameters
     ----------

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sl_projector.errors import StackError
-from sl_reconstruct.height_map import HeightMap
+from sl_common.errors import StackError
+from sl_reconstruct.cloud.height_map import HeightMap
+from sl_reconstruct.cloud.trimmed_fit import trimmed_fit
 from sl_reconstruct.measure.region import Region, select
 from sl_reconstruct.measure.result import Measurement, Quantity, uncertainties
-from sl_reconstruct.measure.trimmed import trimmed_fit
 
 Array = NDArray[np.float64]
 #: Heights (n,) of the reference at x, y (n,), metres; NaN where it has none.

@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from sl_projector.errors import ConfigError, StackError
+from sl_common.errors import ConfigError, StackError
 from sl_reconstruct.measure.groove import measure_groove
 from sl_reconstruct.measure.hole import measure_hole
-from sl_reconstruct.measure.planes import measure_angle, measure_plane
+from sl_reconstruct.measure.plane_angle import measure_angle, measure_plane
 from sl_reconstruct.measure.profile import measure_profile
 from sl_reconstruct.measure.region import Region, Selection, select
 from sl_reconstruct.measure.result import Measurement
 from sl_reconstruct.measure.roughness import measure_roughness
-from sl_reconstruct.measure.rounds import measure_cylinder, measure_sphere
+from sl_reconstruct.measure.sphere_cylinder import measure_cylinder, measure_sphere
 from sl_reconstruct.measure.step import measure_step
 
 #: Width of the strip that a section averages where none is told, as a part of its length.

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sl_projector.errors import StackError
-from sl_reconstruct.measure.planes import AngleMeasurement, measure_angle
+from sl_common.errors import StackError
+from sl_reconstruct.measure.plane_angle import AngleMeasurement, measure_angle
 from sl_reconstruct.measure.region import select
 
 #: The slope at a point is taken from points so many column boundaries on either side.

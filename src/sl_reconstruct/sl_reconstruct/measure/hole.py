@@ -9,13 +9,13 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_projector.errors import StackError
-from sl_reconstruct.height_map import typical_spacing_m
+from sl_common.errors import StackError
+from sl_reconstruct.cloud.height_map import typical_spacing_m
+from sl_reconstruct.cloud.plane_fit import TRIM_SD, fit_plane
 from sl_reconstruct.measure.region import Region, Selection
 from sl_reconstruct.measure.result import Fitted, Measurement, Quantity, uncertainties
 from sl_reconstruct.measure.roughness import crop
-from sl_reconstruct.measure.rounds import fit_rounds
-from sl_reconstruct.plane_fit import TRIM_SD, fit_plane
+from sl_reconstruct.measure.sphere_cylinder import fit_rounds
 
 Array = NDArray[np.float64]
 Method = Literal["intensity", "presence"]

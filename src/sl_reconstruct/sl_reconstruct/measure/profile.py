@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_projector.documents import written_atomically
-from sl_projector.errors import ConfigError, StackError
+from sl_common.documents import written_atomically
+from sl_common.errors import ConfigError, StackError
 from sl_reconstruct.measure.denoise import peak_to_valley
 from sl_reconstruct.measure.region import Region, Selection, select
 from sl_reconstruct.measure.result import SIGNIFICANT, Measurement

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_projector.errors import ConfigError, StackError
+from sl_common.errors import ConfigError, StackError
 
 Array = NDArray[np.float64]
 

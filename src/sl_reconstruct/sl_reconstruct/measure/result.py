@@ -20,7 +20,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_projector.errors import ConfigError, StackError
+from sl_common.errors import ConfigError, StackError
 from sl_reconstruct.measure.region import Region
 
 Array = NDArray[np.float64]

@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_projector.errors import ConfigError, StackError
-from sl_reconstruct.height_map import HeightMap, make_height_map
+from sl_common.errors import ConfigError, StackError
+from sl_reconstruct.cloud.height_map import HeightMap, make_height_map
 from sl_reconstruct.measure.denoise import (
     Corrected,
     Waves,

@@ -9,11 +9,11 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_projector.errors import ConfigError, StackError
+from sl_common.errors import ConfigError, StackError
+from sl_reconstruct.cloud.plane_fit import TRIM_SD, robust_sd
+from sl_reconstruct.cloud.trimmed_fit import trimmed_fit
 from sl_reconstruct.measure.region import Selection
 from sl_reconstruct.measure.result import Measurement, uncertainties
-from sl_reconstruct.measure.trimmed import trimmed_fit
-from sl_reconstruct.plane_fit import TRIM_SD, robust_sd
 
 Array = NDArray[np.float64]
 Axis = Literal["x", "y"]

@@ -1,0 +1,1 @@
+"""The camera, emulated: over a local socket, or as a GigE Vision device."""

@@ -1,0 +1,1 @@
+"""The projector's controllers, emulated at the byte level."""

@@ -1,0 +1,333 @@
+"""USB's side of an emulated HID device: reports queued for the host, faults of the bus, and a
+server that lends the device to another process over a Unix socket (`sl_projector.hid.usb_socket`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import socket
+import struct
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import NoReturn, Protocol
+
+from sl_bench.dlpc.dlpc900_faults import Dlpc900Faults
+from sl_projector.hid import usb_socket as wire
+from sl_projector.hid.usb_socket import UsbIdentity, UsbLink
+
+MAX_QUEUED_REPORTS = 64  # as many as Linux keeps for a hidraw reader
+SHORT_REPORT_BYTES = 3
+DLPC900_IDENTITY = UsbIdentity(0x0451, 0xC900, "EMU0001")
+
+
+class HidDevice(Protocol):
+    """A device behind the bus: takes reports, returns reports."""
+
+    faults: Dlpc900Faults
+
+    def receive(self, report: bytes) -> list[bytes]:
+        """Take a report, return what is answered."""
+        ...
+
+    def forget_message(self) -> None:
+        """Drop an incomplete message."""
+        ...
+
+    def power_cycle(self) -> None:
+        """Lose all state."""
+        ...
+
+
+def _fail(number: int) -> NoReturn:
+    raise OSError(number, os.strerror(number))
+
+
+class EmulatedUsb:
+    """The bus with one device on it.
+
+    Parameters
+    ----------
+    device : HidDevice
+        What receives the reports, e.g. a `Dlpc900Emulator`.
+    identity : UsbIdentity
+        Vendor, product and serial number.
+    """
+
+    def __init__(
+        self,
+        device: HidDevice,
+        identity: UsbIdentity = DLPC900_IDENTITY,
+    ) -> None:
+        self.device = device
+        self.identity = identity
+        self.present = True
+        self._plugged = 0
+        self._owner: EmulatedLink | None = None
+        self._replies: deque[tuple[float, bytes]] = deque(maxlen=MAX_QUEUED_REPORTS)
+        self._ready = threading.Condition()
+
+    @property
+    def claimed(self) -> bool:
+        """True while a host has the interface."""
+        return self._owner is not None
+
+    def connect(self) -> EmulatedLink:
+        """Return a host's view of the device."""
+        return EmulatedLink(self)
+
+    def unplug(self) -> None:
+        """Take the device from the bus; it keeps its power and its state."""
+        with self._ready:
+            self.present = False
+            self._plugged += 1
+            self._owner = None
+            self._ready.notify_all()
+
+    def plug_in(self) -> None:
+        """Put it back; hosts must open it anew."""
+        with self._ready:
+            self.device.forget_message()
+            self._replies.clear()
+            self.present = True
+
+    def power_cycle(self) -> None:
+        """Switch the device off and on: it leaves the bus and comes back without memory."""
+        self.unplug()
+        self.device.power_cycle()
+        self.plug_in()
+
+    def check_present(self, plugged: int) -> None:
+        """Raise ENODEV when the device is not, or not any more, the one that was opened."""
+        if not self.present or plugged != self._plugged:
+            _fail(errno.ENODEV)
+
+    @property
+    def plugged(self) -> int:
+        """Number of times that it was taken out."""
+        return self._plugged
+
+    def claim(self, link: EmulatedLink) -> None:
+        """Give the interface to a host; EBUSY when another has it."""
+        faults = self.device.faults
+        with self._ready:
+            if not self.present:
+                _fail(errno.ENODEV)
+            if faults.kernel_driver or faults.taken or self._owner not in (None, link):
+                _fail(errno.EBUSY)
+            self._owner = link
+            self.device.forget_message()
+
+    def release(self, link: EmulatedLink) -> None:
+        """Take the interface back."""
+        with self._ready:
+            if self._owner is link:
+                self._owner = None
+
+    def transfer_out(self, link: EmulatedLink, report: bytes) -> None:
+        """Carry a report to the device and queue what it answers."""
+        self._check_transfer(link)
+        replies = self.device.receive(report)
+        if replies:
+            self._overwrite()
+        for reply in replies:
+            self._queue(reply)
+
+    def _overwrite(self) -> None:
+        """Drop what the host did not read: the controller has one buffer for answers."""
+        now_s = time.monotonic()
+        with self._ready:
+            late = [entry for entry in self._replies if entry[0] > now_s]
+            self._replies.clear()
+            self._replies.extend(late)
+
+    def _check_transfer(self, link: EmulatedLink) -> None:
+        if self._owner is not link:
+            _fail(errno.ENODEV)
+        if self.device.faults.take("stalls"):
+            _fail(errno.EPIPE)
+
+    def _queue(self, reply: bytes) -> None:
+        faults = self.device.faults
+        if faults.take("lose_replies"):
+            return
+        ready_s = time.monotonic()
+        if faults.take("late_replies"):
+            ready_s += faults.late_s
+        with self._ready:
+            if faults.take("stale_replies"):
+                old = bytes([reply[0], (reply[1] - 1) & 0xFF])
+                self._replies.append((ready_s, (old + reply[2:4] + b"\xff" * 60)))
+            if faults.take("empty_replies"):
+                reply = reply[:2] + bytes(len(reply) - 2)
+            if faults.take("short_replies"):
+                reply = reply[:SHORT_REPORT_BYTES]
+            self._replies.append((ready_s, reply))
+            self._ready.notify_all()
+
+    def transfer_in(self, link: EmulatedLink, size: int, timeout_ms: int) -> bytes:
+        """Wait for a report from the device."""
+        self._check_transfer(link)
+        deadline_s = time.monotonic() + timeout_ms / 1000
+        with self._ready:
+            while True:
+                if self._owner is not link:
+                    _fail(errno.ENODEV)
+                now_s = time.monotonic()
+                report = next((r for r in self._replies if r[0] <= now_s), None)
+                if report is not None:
+                    self._replies.remove(report)
+                    return report[1][:size]
+                if now_s >= deadline_s:
+                    _fail(errno.ETIMEDOUT)
+                wake_s = min([deadline_s, *(r[0] for r in self._replies)])
+                self._ready.wait(max(wake_s - now_s, 1e-4))
+
+
+class EmulatedLink:
+    """One host's view of the emulated bus; a `UsbLink`."""
+
+    def __init__(self, bus: EmulatedUsb) -> None:
+        self._bus = bus
+        self._plugged = bus.plugged
+
+    def describe(self) -> UsbIdentity:
+        """See `UsbLink`."""
+        if not self._bus.present:
+            _fail(errno.ENODEV)
+        return self._bus.identity
+
+    def claim(self) -> None:
+        """See `UsbLink`."""
+        self._plugged = self._bus.plugged
+        self._bus.claim(self)
+
+    def release(self) -> None:
+        """See `UsbLink`."""
+        self._bus.release(self)
+
+    def write(self, endpoint: int, report: bytes, timeout_ms: int) -> int:
+        """See `UsbLink`."""
+        self._bus.check_present(self._plugged)
+        self._bus.transfer_out(self, report)
+        return len(report)
+
+    def read(self, endpoint: int, size: int, timeout_ms: int) -> bytes:
+        """See `UsbLink`."""
+        self._bus.check_present(self._plugged)
+        return self._bus.transfer_in(self, size, timeout_ms)
+
+    def clear_halt(self, endpoint: int) -> None:
+        """See `UsbLink`."""
+        self._bus.check_present(self._plugged)
+
+    def kernel_driver_active(self) -> bool:
+        """See `UsbLink`."""
+        return self._bus.device.faults.kernel_driver
+
+    def detach_kernel_driver(self) -> None:
+        """See `UsbLink`."""
+        self._bus.device.faults.kernel_driver = False
+
+    def attach_kernel_driver(self) -> None:
+        """See `UsbLink`."""
+
+
+def _perform(link: UsbLink, request: bytes) -> bytes:
+    operation, endpoint, timeout_ms = wire.REQUEST.unpack_from(request)
+    payload = request[wire.REQUEST.size :]
+    if operation == wire.DESCRIBE:
+        identity = link.describe()
+        return wire.IDENTITY.pack(identity.vendor, identity.product) + identity.serial.encode()
+    if operation == wire.WRITE:
+        link.write(endpoint, payload, timeout_ms)
+        return b""
+    if operation == wire.READ:
+        return link.read(endpoint, wire.SIZE.unpack(payload)[0], timeout_ms)
+    if operation == wire.KERNEL_DRIVER:
+        return bytes([link.kernel_driver_active()])
+    simple = {
+        wire.CLAIM: link.claim,
+        wire.RELEASE: link.release,
+        wire.CLEAR_HALT: lambda: link.clear_halt(endpoint),
+        wire.DETACH: link.detach_kernel_driver,
+        wire.ATTACH: link.attach_kernel_driver,
+    }
+    if operation not in simple:
+        _fail(errno.ENOSYS)
+    simple[operation]()
+    return b""
+
+
+class UsbSocketServer:
+    """Lends an emulated device to other processes, one connection an opened device.
+
+    Parameters
+    ----------
+    path : str
+        The Unix socket; removed at `close`. Only its owner may connect.
+    bus : EmulatedUsb
+        The device.
+    """
+
+    def __init__(self, path: str, bus: EmulatedUsb) -> None:
+        self._path = Path(path)
+        self._bus = bus
+        self._closed = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._connections: set[socket.socket] = set()
+        self._path.unlink(missing_ok=True)
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._listener.bind(path)
+        self._path.chmod(0o600)
+        self._listener.listen()
+        self._start(self._accept, "usb-accept")
+
+    def _start(self, target: object, name: str, *args: object) -> None:
+        thread = threading.Thread(target=target, args=args, name=name, daemon=True)  # type: ignore[arg-type]
+        self._threads = [t for t in self._threads if t.is_alive()] + [thread]
+        thread.start()
+
+    def _accept(self) -> None:
+        while not self._closed.is_set():
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return
+            self._connections.add(connection)
+            self._start(self._serve, "usb-serve", connection)
+
+    def _serve(self, connection: socket.socket) -> None:
+        link = self._bus.connect()
+        try:
+            with connection, contextlib.suppress(OSError):
+                while True:
+                    wire.send_frame(connection, self._respond(link, connection))
+        finally:
+            link.release()
+            self._connections.discard(connection)
+
+    def _respond(self, link: UsbLink, connection: socket.socket) -> bytes:
+        request = wire.receive_frame(connection)
+        try:
+            return wire.ANSWER.pack(0) + _perform(link, request)
+        except OSError as error:
+            return wire.ANSWER.pack(error.errno or errno.EIO)
+        except struct.error:
+            return wire.ANSWER.pack(errno.EINVAL)
+
+    def close(self) -> None:
+        """Drop all connections and remove the socket."""
+        self._closed.set()
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        for connection in list(self._connections):
+            with contextlib.suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+        for thread in self._threads:
+            thread.join(5.0)
+        self._path.unlink(missing_ok=True)

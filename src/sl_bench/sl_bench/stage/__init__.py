@@ -1,0 +1,1 @@
+"""Stages, emulated on pseudo-terminals: GRBL and Zaber."""

@@ -1,0 +1,253 @@
+"""``slrig calibrate``: calibrate the rig with the running graph, or stored observations again."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sl_bringup.cli.up import add_graph_arguments, graph_options, until_signal
+from sl_bringup.graph.console import complain, say
+from sl_bringup.graph.graph import Graph, GraphOptions, exec_client, is_running
+from sl_common.documents import read_document
+from sl_common.errors import ConfigError
+
+if TYPE_CHECKING:
+    from sl_calibration.workflow.conclude import Outcome
+
+CLIENT = "sl_bringup.calibrate_node"
+INTERRUPTED = 130
+
+
+def add_parser(subparsers: Any) -> None:
+    """Register ``slrig calibrate``."""
+    parser = subparsers.add_parser(
+        "calibrate",
+        help="calibrate the rig on the hole plate",
+        description="Ask the graph to calibrate: the plate at several heights, camera and "
+        "projector, uncertainty, verdict, report. The exit status is 0 only when a calibration "
+        "was accepted and is in force. With --from, a recording (slrig record, during the run) or "
+        "the observations in a run's folder are solved again, without a graph; nothing is put in "
+        "force then.",
+        epilog="examples:\n"
+        "  slrig calibrate\n"
+        "  slrig calibrate --heights-mm -1 -0.5 0 0.5 1\n"
+        "  slrig calibrate --target projector\n"
+        "  slrig calibrate --verify --heights-mm -0.8 0 0.8\n"
+        "  slrig calibrate --from calibrations/2026-01-31_120000_run --output again\n"
+        "  slrig calibrate --from recorded_bag --output again\n"
+        "  slrig calibrate --from calibrations/2026-01-31_120000_run --opencv rig.xml\n"
+        "  slrig calibrate --up --bench --surface hole_plate",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--from", dest="source", type=Path, metavar="RUN|BAG",
+        help="solve this run's folder, or the calibration in this recording, again, offline",
+    )  # fmt: skip
+    parser.add_argument("--output", type=Path, metavar="DIR", help="with --from: for the results")
+    parser.add_argument(
+        "--opencv", type=Path, metavar="FILE",
+        help="with --from: write the run's calibration for OpenCV (.xml, .yml, .json) instead",
+    )  # fmt: skip
+    parser.add_argument(
+        "--heights-mm", type=float, nargs="+", default=[], metavar="Z",
+        help="stage heights of the views (default: the node's), or to verify at",
+    )  # fmt: skip
+    parser.add_argument(
+        "--target",
+        choices=["both", "camera", "projector"],
+        default="both",
+        help="what to calibrate; one device alone: the other keeps its lens",
+    )
+    parser.add_argument(
+        "--keep", type=Path, metavar="FILE",
+        help="with --target: calibration whose other device is kept (default: the one in force)",
+    )  # fmt: skip
+    parser.add_argument("--sequence", default="", help="patterns, both axes (default: the node's)")
+    parser.add_argument(
+        "--verify", nargs="?", const="plate", choices=["plate", "flat"],
+        help="only check the calibration in force, on the plate or a flat (default: plate)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--timeout", type=float, default=600.0, metavar="S", help="for the run (default: 600)"
+    )
+    parser.add_argument(
+        "--up", action="store_true", help="start the graph for this run where none is running"
+    )
+    parser.add_argument(
+        "--ready-timeout", type=float, default=240.0, metavar="S",
+        help="with --up: for the graph to get ready (default: 240)",
+    )  # fmt: skip
+    add_graph_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def client_arguments(args: argparse.Namespace) -> list[str]:
+    """Arguments of the ROS client."""
+    words = ["--target", args.target, "--timeout", f"{args.timeout}"]
+    if args.sequence:
+        words += ["--sequence", args.sequence]
+    if args.heights_mm:
+        words += ["--heights-m", *(f"{height * 1e-3}" for height in args.heights_mm)]
+    if args.keep:
+        words += ["--keep", str(args.keep.resolve())]
+    return [*words, "--verify", args.verify] if args.verify else words
+
+
+async def calibrate_once(
+    options: GraphOptions,
+    client: Sequence[str],
+    ready_timeout_s: float,
+    tell: Callable[[str], None],
+) -> int:
+    """Start a graph, calibrate, stop the graph; 0 only when all went well."""
+
+    async def work(graph: Graph) -> int:
+        if not await graph.ready(ready_timeout_s):
+            return 1
+        return await graph.run_client(CLIENT, *client)
+
+    async with Graph(options, tell) as graph:
+        status = await until_signal(work(graph))
+    if status is None:
+        return INTERRUPTED
+    for reason in graph.supervisor.unclean:
+        complain(f"slrig calibrate: at the end, {reason}")
+    return status or int(bool(graph.supervisor.unclean))
+
+
+async def calibrate_bench(graph: Graph, options: GraphOptions) -> int:
+    """Put the hole plate on the bench, calibrate, put the configured part back."""
+    # Imported late: hardware does without it.
+    from sl_bench.process.bench_control import BenchControl
+    from sl_bench.process.bench_settings import read_settings
+
+    config = options.directory / "config.yaml"
+    part = read_settings(config)
+
+    def put(surface: str, finish: str, parameters: Mapping[str, Any]) -> None:
+        with BenchControl(options.directory) as bench:
+            bench.put(surface, finish, **parameters)
+
+    say("calibrating: the hole plate is on the stage")
+    await asyncio.to_thread(put, "hole_plate", "matt", _plate_on_bench(config, options))
+    status = await graph.run_client(CLIENT)
+    await asyncio.to_thread(put, part.surface, part.finish, part.surface_parameters)
+    say(f"the {part.surface} is on the stage again")
+    return status
+
+
+def _plate_on_bench(config: Path, options: GraphOptions) -> dict[str, Any]:
+    """Parameters of the bench's hole plate, as the calibration's node believes it to be."""
+    document = read_document(config, ConfigError)
+    section = document.get(f"{options.changes.namespace}/calibration", {})
+    parameters = section.get("ros__parameters", {})
+    names = ("columns", "rows", "pitch_m", "diameter_m", "chamfer_m", "origin_diameter_m")
+    found = {n: parameters[f"plate_{n}"] for n in names if f"plate_{n}" in parameters}
+    mark = [f"plate_origin_{axis}" for axis in ("column", "row")]
+    return found | ({"origin_id": [parameters[n] for n in mark]} if mark[0] in parameters else {})
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out ``slrig calibrate``."""
+    if args.source is not None:
+        if args.opencv:
+            return export(args.source, args.opencv)
+        return solve_again(args.source, args.output)
+    if args.opencv:
+        raise ConfigError("--opencv writes a run's calibration; expected --from RUN beside it")
+    options = graph_options(args)
+    client = client_arguments(args)
+    if args.up and not is_running(options.directory):
+        log = options.directory / "graph.log"
+        say(f"starting the graph{' on the bench' if options.bench else ''} (log: {log})")
+        with log.open("w") as file:
+            tell = _writer(file)
+            return asyncio.run(calibrate_once(options, client, args.ready_timeout, tell))
+    return exec_client(CLIENT, options, *client)
+
+
+def _writer(file: Any) -> Callable[[str], None]:
+    def tell(line: str) -> None:
+        file.write(line + "\n")
+
+    return tell
+
+
+def solve_again(source: Path, output: Path | None) -> int:
+    """Solve a stored run, or the calibration in a recording, again; nothing is put in force."""
+    from sl_bringup.evaluation.calibrate_bag import solve_recorded
+    from sl_calibration.data.run_store import OBSERVATIONS
+    from sl_calibration.workflow.conclude import solve_stored
+
+    stored = source.suffix == ".npz" or (source / OBSERVATIONS).is_file()
+    notes: list[str] = []
+    if stored:
+        run = source if source.is_dir() else source.with_suffix("")
+        outcome = solve_stored(source, output or run / "again")
+    else:
+        name = source.name if source.is_dir() else source.stem
+        folder = output or Path(f"{name}_calibration")
+        outcome, notes = solve_recorded(source, folder, tell=complain)
+    for line in [*outcome_lines(outcome), *notes]:
+        say(line)
+    return 0 if outcome.accepted else 1
+
+
+def export(source: Path, file: Path) -> int:
+    """Write a calibration (a file, or a run's) for OpenCV's tools."""
+    from sl_calibration.data.run_store import CALIBRATION
+    from sl_calibration.report.opencv_export import opencv_values, save_opencv
+    from sl_reconstruct.model.calibration_file import load_rig
+
+    rig = load_rig(source / CALIBRATION if source.is_dir() else source)
+    save_opencv(file, rig)
+    values = opencv_values(rig)
+    errors = (values[f"{name}_lens_error_px"] for name in ("cam", "proj"))
+    camera, projector = (f"{error:.4f} px" for error in errors)
+    say(f"{file}: OpenCV's lens is off the paper's by {camera} (camera), {projector} (projector)")
+    return 0
+
+
+def outcome_lines(outcome: Outcome | Any) -> list[str]:
+    """Lines that tell a person what came out; of an `Outcome` or the action's result."""
+    lines = [outcome.message]
+    if outcome.views:
+        lines += [
+            f"views             {outcome.views}, {outcome.holes} holes",
+            f"camera            {outcome.camera_rms_px:.4f} px, "
+            f"{outcome.camera_rms_m * 1e6:.3f} um on the part (rms of the holes)",
+            *_stage_lines(outcome),
+        ]
+    if outcome.projector_rms_px:
+        lines += [
+            f"projector         {outcome.projector_rms_px:.4f} px, "
+            f"{outcome.projector_rms_m * 1e6:.3f} um on the part (rms of the targets)",
+            f"sigma of z        {outcome.predicted_sigma_m * 1e6:.3f} um at worst in the volume",
+            f"left-out heights  {outcome.left_out_rms_m * 1e6:.3f} um rms of z",
+        ]
+    if outcome.calibration_file:
+        lines += [
+            f"calibration       {outcome.calibration_file}",
+            f"hash              {outcome.hash}",
+        ]
+    if outcome.report:
+        lines.append(f"report            {outcome.report}")
+    return lines
+
+
+def _stage_lines(outcome: Outcome | Any) -> list[str]:
+    """Lines that tell what the stage really does."""
+    lean = ", ".join(f"{math.degrees(angle):+.4f}" for angle in outcome.stage_z_lean_rad)
+    lines = [
+        f"stage z           scale off by {(outcome.stage_z_scale - 1) * 1e6:+.0f} ppm, leans by "
+        f"({lean}) deg from the plate's normal"
+    ]
+    square = [math.degrees(angle) for angle in outcome.stage_squareness_rad]
+    if all(map(math.isfinite, square)):
+        xy, xz, yz = square
+        lines.append(f"stage squareness  xy {xy:+.4f}, xz {xz:+.4f}, yz {yz:+.4f} deg off 90")
+    return lines

@@ -1,0 +1,70 @@
+"""``slrig doctor``: what is missing on this machine, and what mends it."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import Any
+
+from sl_bringup.cli.up import add_graph_arguments, graph_options
+from sl_bringup.graph import doctor_checks as checks
+from sl_bringup.graph.console import say
+from sl_bringup.graph.doctor_checks import Finding
+from sl_bringup.graph.graph import GraphOptions, is_running
+
+_MARKS = {"ok": "ok  ", "note": "note", "bad": "BAD "}
+
+
+def examine(options: GraphOptions) -> list[Finding]:
+    """Check everything; a check that fails by itself is a finding too."""
+    steps: list[Callable[[], list[Finding]]] = [
+        checks.python, checks.libraries, checks.ros, checks.shared_memory,
+        lambda: checks.configuration(options), lambda: _devices(options),
+        lambda: checks.graph(options),
+    ]  # fmt: skip
+    return [finding for step in steps for finding in _guarded(step)]
+
+
+def _devices(options: GraphOptions) -> list[Finding]:
+    if options.bench:
+        return []
+    # Imported late: the drivers need libraries that may be what is missing.
+    from sl_bringup.graph.doctor_devices import devices
+
+    return devices(options.source, is_running(options.directory))
+
+
+def _guarded(step: Callable[[], list[Finding]]) -> list[Finding]:
+    try:
+        return step()
+    except Exception as error:  # the doctor reports, whatever it meets
+        return [Finding("bad", "check", f"could not be made: {error!r}", "report this")]
+
+
+def add_parser(subparsers: Any) -> None:
+    """Register ``slrig doctor``."""
+    parser = subparsers.add_parser(
+        "doctor",
+        help="say what is missing on this machine, and what to do",
+        description="Check Python, libraries, ROS, shared memory, configuration, devices and the "
+        "running graph. Devices are asked how they are and never moved; those of a running graph "
+        "are left to it, and it tells. (An Arduino at a serial port restarts when it is opened.) "
+        "With --bench nothing about hardware is asked for. The exit status is 0 when nothing that "
+        "is needed is missing.",
+        epilog="examples:\n  slrig doctor --bench\n  slrig doctor --config my_rig.yaml",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_graph_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out ``slrig doctor``."""
+    findings = examine(graph_options(args))
+    for finding in findings:
+        say(f"{_MARKS[finding.level]} {finding.subject:<14} {finding.text}")
+        if finding.remedy:
+            say(f"{'':<19} -> {finding.remedy}")
+    bad = sum(finding.level == "bad" for finding in findings)
+    say(f"{bad} thing{'s' if bad != 1 else ''} to mend" if bad else "all is well")
+    return 1 if bad else 0

@@ -1,0 +1,117 @@
+"""``slrig up``: start the node graph on one configuration file and supervise it."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import signal
+from collections.abc import Awaitable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, TypeVar
+
+from sl_bringup.graph.console import complain, say
+from sl_bringup.graph.graph import Graph, GraphOptions
+from sl_bringup.graph.graph_config import Changes
+from sl_common.errors import ConfigError
+
+_ResultT = TypeVar("_ResultT")
+
+
+def add_graph_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments that say which graph is meant and how it is started."""
+    parser.add_argument("--bench", action="store_true", help="simulated bench, no hardware")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="ROS parameter file")
+    parser.add_argument("--calibration", type=Path, metavar="FILE", help="calibration of the rig")
+    parser.add_argument(
+        "--surface", default="", help="part on the bench (groove, coin, plate, ...)"
+    )
+    parser.add_argument(
+        "--domain", type=int, default=int(os.environ.get("ROS_DOMAIN_ID") or 0),
+        help="ROS domain, 0 to 101 (default: ROS_DOMAIN_ID, else 0)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--network", action="store_true", help="open to other machines; else loopback only"
+    )
+    parser.add_argument(
+        "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...",
+        help="all that follows is passed on to every node",
+    )  # fmt: skip
+
+
+def graph_options(args: argparse.Namespace) -> GraphOptions:
+    """Options of the graph, from parsed arguments.
+
+    Raises
+    ------
+    ConfigError
+        When they contradict each other.
+    """
+    if args.surface and not args.bench:
+        raise ConfigError("--surface is a part on the bench; expected --bench beside it")
+    for file in (args.config, args.calibration):
+        if file is not None and not file.is_file():
+            raise ConfigError(f"no file {file}")
+    ros_args = tuple(a for a in args.ros_args if a not in ("--ros-args", "--"))
+    changes = Changes(args.calibration, args.surface, ros_args)
+    return GraphOptions(args.bench, args.config, changes, args.domain, args.network)
+
+
+async def until_signal(work: Awaitable[_ResultT]) -> _ResultT | None:
+    """Await something until SIGINT or SIGTERM comes; it is cancelled then, and None returned."""
+    loop = asyncio.get_running_loop()
+    task = asyncio.ensure_future(work)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, task.cancel)
+    try:
+        return await task
+    except asyncio.CancelledError:
+        return None
+    finally:
+        # From here on the stop is under way; another Ctrl-C must not leave processes behind.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, lambda: None)
+
+
+async def supervise(options: GraphOptions) -> int:
+    """Run a graph until a signal ends it; 0 when it had been ready and ended cleanly."""
+    was_ready = False
+
+    async def watch(graph: Graph) -> None:
+        nonlocal was_ready
+        was_ready = await graph.ready(timeout_s=0.0)
+        if was_ready:
+            say(f"graph ready (domain {options.domain}, {options.directory}); Ctrl-C ends it")
+        await asyncio.Event().wait()
+
+    async with Graph(options, say) as graph:
+        with suppress(asyncio.CancelledError):
+            await until_signal(watch(graph))
+        say("stopping")
+    for reason in graph.supervisor.unclean:
+        complain(f"slrig up: {reason}")
+    return 0 if was_ready and not graph.supervisor.unclean else 1
+
+
+def add_parser(subparsers: Any) -> None:
+    """Register ``slrig up``."""
+    parser = subparsers.add_parser(
+        "up",
+        help="start the node graph and supervise it",
+        description="Start every node as a process of its own on one configuration file, restart "
+        "one that dies, stop all on Ctrl-C. The exit status is 0 when the graph had been ready "
+        "and everything ended cleanly.",
+        epilog="examples:\n"
+        "  slrig up --bench --surface coin\n"
+        "  slrig up --config my_rig.yaml --calibration my_rig_calibration.yaml\n"
+        "  slrig up --bench --domain 7 --ros-args --log-level debug",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_graph_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out ``slrig up``."""
+    return asyncio.run(supervise(graph_options(args)))

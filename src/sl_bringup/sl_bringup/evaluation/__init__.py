@@ -1,0 +1,1 @@
+"""Recordings turned into clouds, calibrations and comparisons, without ROS."""

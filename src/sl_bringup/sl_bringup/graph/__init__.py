@@ -1,0 +1,1 @@
+"""The node graph as processes of this machine: configuration, supervision, transport, doctor."""

@@ -1,0 +1,52 @@
+"""Commands that are ROS nodes themselves: they take the place of the process that was started.
+
+Signals then reach them directly, and the middleware finds its environment from the first
+instruction on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from sl_bringup.graph.graph_config import NAMESPACE, runtime_directory
+from sl_bringup.graph.transport import Transport, process_environment
+
+
+def add_client_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments that say which graph is meant."""
+    parser.add_argument("--namespace", default=NAMESPACE, help="of the rig (default: /sl)")
+    parser.add_argument(
+        "--domain", type=int, default=int(os.environ.get("ROS_DOMAIN_ID") or 0),
+        help="ROS domain, 0 to 101 (default: ROS_DOMAIN_ID, else 0)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--network", action="store_true", help="open to other machines; else loopback only"
+    )
+
+
+def become_client(
+    module: str, args: argparse.Namespace, words: Sequence[str], segment: str = ""
+) -> NoReturn:
+    """Replace this process by a client of the graph.
+
+    Parameters
+    ----------
+    module : str
+        With `main`.
+    args : Namespace
+        From a parser with `add_client_arguments`.
+    words : sequence of str
+        The client's arguments.
+    segment : str
+        Node whose shared memory the client needs, where it publishes large messages.
+    """
+    transport = Transport(runtime_directory(args.domain), args.domain, args.network)
+    environment = process_environment(transport.environment(segment))
+    namespace = "/" + args.namespace.strip("/")
+    command = [sys.executable, "-m", module, "--namespace", namespace, *words]
+    sys.stdout.flush()
+    os.execve(sys.executable, command, environment)

@@ -1,0 +1,364 @@
+"""The doctor's look at the devices: what there is, how it is, what is wrong, and what mends it.
+
+Devices are asked, never moved. Of a graph that runs they are its own; it tells how they are.
+"""
+
+from __future__ import annotations
+
+import grp
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+import sl_projector
+from sl_bringup.graph.doctor_checks import Finding, find_usb, serial_ports
+from sl_bringup.graph.graph_config import NODES, started_nodes
+from sl_camera.drivers.aravis_library import INSTALL as ARAVIS_INSTALL
+from sl_camera.drivers.aravis_library import find_camera, list_cameras, load_aravis
+from sl_camera.drivers.camera_drivers import make_camera
+from sl_camera.stage.grbl.grbl_stage import GrblStage
+from sl_camera.stage.stage import StageDriver
+from sl_camera.stage.zaber.zaber_stage import ZaberStage, zaber_axes
+from sl_common.errors import DeviceLost, DeviceTimeout, SlError
+from sl_projector.dlpc.dlpc350_driver import Dlpc350
+from sl_projector.dlpc.dlpc900_driver import Dlpc900
+from sl_projector.dlpc.dmd import DEFAULT_MODEL, MODELS, dmd_model
+from sl_projector.hid.usb_transport import serial_number
+
+VENDOR = 0x0451
+#: USB product of each controller.
+CONTROLLERS = {"DLPC900": 0xC900, "DLPC350": 0x6401}
+USB_NODES = Path("/dev/bus/usb")
+PSEUDO_TERMINALS = Path("/dev/pts")
+SERIAL_NAMES = Path("/dev/serial/by-id")
+RULES_DIRECTORIES = tuple(
+    map(Path, ("/etc/udev/rules.d", "/run/udev/rules.d", "/lib/udev/rules.d"))
+)
+RULES = Path(sl_projector.__file__).parents[1] / "udev" / "60-sl-projector.rules"
+RELOAD = (
+    "sudo udevadm control --reload && sudo udevadm trigger, then unplug it and plug it in again"
+)
+#: What is said of devices that the configuration has no section for.
+LEFT_OUT = {
+    "camera": Finding(
+        "note", "camera", "no section /sl/camera: another driver is to publish camera/image_raw",
+        "remap that driver's images (docs/cameras.md)",
+    ),
+    "stage": Finding(
+        "note", "stage", "no section /sl/stage: a rig without a stage",
+        "say require_pose: false in the section /sl/synchronizer",
+    ),
+}  # fmt: skip
+#: Longest wait for a stage's answer; grblHAL may need a second.
+STAGE_TIMEOUT_S = 2.0
+
+
+def devices(source: Path, running: bool) -> list[Finding]:
+    """Look at all devices that a configuration names; ``running``: its graph has them open."""
+    sections = yaml.safe_load(source.read_text()) or {}
+
+    def of(node: str) -> dict[str, Any]:
+        return dict(sections.get(f"/sl/{node}", {}).get("ros__parameters", {}))
+
+    looks = ((projector, "projector"), (stage, "stage"), (camera, "camera"))
+    left_out = set(NODES) - set(started_nodes(source))
+    return [
+        finding
+        for look, node in looks
+        for finding in ([LEFT_OUT[node]] if node in left_out else look(of(node), running))
+    ]
+
+
+# -- permissions and owners -----------------------------------------------------------------
+
+
+def _may_use(node: Path) -> bool:
+    return os.access(node, os.R_OK | os.W_OK)
+
+
+def _join_group(node: Path) -> str:
+    """Return the command that gives the user a device's group."""
+    number, user = node.stat().st_gid, os.environ.get("USER", "$USER")
+    try:
+        group = grp.getgrgid(number)
+    except KeyError:  # in a container, the host's groups have no names
+        return f"in a container: start it with --group-add {number}"
+    if user in group.gr_mem:
+        return (
+            f"you were put into the group {group.gr_name}, but not yet when you logged in: "
+            "log in again"
+        )
+    return f"sudo usermod -aG {group.gr_name} {user}, then log out and in again"
+
+
+def _holders(node: Path) -> str:
+    """Name the processes that have a device file open; empty when none is known."""
+    files = list(_open_files())
+    found = {pid for pid, file in files if file == str(node)}
+    if node.parent == PSEUDO_TERMINALS:  # an emulator's: who serves it does not keep it busy
+        found -= {pid for pid, file in files if file.endswith("/ptmx")}
+    names = (f"{_name(pid)} (process {pid})" for pid in sorted(found) if pid != os.getpid())
+    return ", ".join(names)
+
+
+def _open_files() -> Iterator[tuple[int, str]]:
+    for link in Path("/proc").glob("[0-9]*/fd/*"):
+        try:
+            yield int(link.parts[2]), str(link.readlink())
+        except OSError:
+            continue  # another user's, or gone
+
+
+def _name(pid: int) -> str:
+    try:
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
+    except OSError:
+        return "a program"
+    return " ".join(words[:3]).strip()
+
+
+def _busy(subject: str, text: str, node: Path | None) -> Finding:
+    holders = _holders(node) if node else ""
+    if holders:
+        return Finding("bad", subject, f"{text}: {holders} has it", "stop that program")
+    remedy = f"sudo fuser -v {node}   shows who has it; stop that" if node else "stop who has it"
+    return Finding("bad", subject, text, remedy)
+
+
+# -- projector ------------------------------------------------------------------------------------
+
+
+def projector(parameters: dict[str, Any], running: bool) -> list[Finding]:
+    """The projector's controller: there, permitted, free, of the right kind, and well."""
+    name, device = parameters.get("dmd_model", DEFAULT_MODEL), parameters.get("device", "usb")
+    if name not in MODELS:
+        text = f"dmd_model {name!r} is unknown; there are {', '.join(sorted(MODELS))}"
+        return [Finding("bad", "projector", text, "correct dmd_model in the configuration")]
+    kind, _, place = str(device).partition(":")
+    if kind == "socket":
+        if not Path(place).exists():
+            remedy = "start what serves it (the bench: slrig up --bench), or say device: usb"
+            return [Finding("bad", "projector", f"nothing at {place}", remedy)]
+        return [_projector_state(str(device), str(name), running, None)]
+    return _usb_projector(str(device), str(name), running)
+
+
+def _usb_projector(device: str, name: str, running: bool) -> list[Finding]:
+    chip = MODELS[name].controller
+    try:
+        there = {c: find_usb(VENDOR, product) for c, product in CONTROLLERS.items()}
+    except SlError as error:
+        return [Finding("bad", "projector", str(error), "sudo apt install libusb-1.0-0")]
+    if there[chip]:
+        return [_chosen(there[chip], device, name, running)]
+    others = [other for other, found in there.items() if found]
+    if others:
+        models = [m.name for m in MODELS.values() if m.controller == others[0]]
+        remedy = f"say dmd_model: {' or '.join(models)} in the configuration"
+        text = f"no {chip}, but a {others[0]} is on the USB"
+        return [Finding("bad", "projector", text, remedy)]
+    text = f"no {chip} ({VENDOR:04x}:{CONTROLLERS[chip]:04x}) on the USB; the configuration asks "
+    remedy = "plug it in and switch it on (lsusb must list it); without hardware: add --bench"
+    return [Finding("bad", "projector", text + f"for a {name}", remedy)]
+
+
+def _chosen(found: list[Any], device: str, name: str, running: bool) -> Finding:
+    """Of the controllers on the USB the one that the configuration means."""
+    chip, serial = MODELS[name].controller, device.partition(":")[2]
+    means = [one for one in found if not serial or serial_number(one) == serial]
+    closed = [one for one in found if not _may_use(_usb_node(one))]
+    if not means and not closed:
+        there = ", ".join(serial_number(one) or "none" for one in found)
+        text = f"no {chip} of serial number {serial!r}; on the USB: {there}"
+        remedy = "correct device in the configuration (usb: the first that is found)"
+        return Finding("bad", "projector", text, remedy)
+    node = _usb_node((means or closed)[0])
+    if not _may_use(node):
+        return _forbidden(chip, node)
+    return _projector_state(device, name, running, node)
+
+
+def _usb_node(device: Any) -> Path:
+    return USB_NODES / f"{device.bus:03d}" / f"{device.address:03d}"
+
+
+def _forbidden(chip: str, node: Path) -> Finding:
+    """No permission: the rule is missing, or there and not in force."""
+    if not node.exists():
+        text = f"{chip} is on the USB, but there is no {node}"
+        remedy = "in a container: start it with --device=/dev/bus/usb"
+        return Finding("bad", "projector", text, remedy)
+    rule = _udev_rule(CONTROLLERS[chip])
+    if rule is None:
+        text = f"{chip} is there, but you have no permission for {node} and no udev rule gives it"
+        return Finding("bad", "projector", text, f"sudo cp {RULES} /etc/udev/rules.d/ && {RELOAD}")
+    text = f"{chip} is there, {rule} has a rule for it, but you have no permission for {node}"
+    return Finding("bad", "projector", text, f"{RELOAD}; or {_join_group(node)}")
+
+
+def _udev_rule(product: int) -> Path | None:
+    """First udev rule that names a controller."""
+    for directory in RULES_DIRECTORIES:
+        for file in sorted(directory.glob("*.rules")):
+            lines = file.read_text(errors="replace").splitlines()
+            rules = (line.lower() for line in lines if not line.lstrip().startswith("#"))
+            if any(f'"{VENDOR:04x}"' in rule and f'"{product:04x}"' in rule for rule in rules):
+                return file
+    return None
+
+
+def _projector_state(device: str, name: str, running: bool, node: Path | None) -> Finding:
+    chip, place = MODELS[name].controller, f" at {node}" if node else f" at {device}"
+    if running:
+        return Finding("ok", "projector", f"{chip}{place}, the running graph has it")
+    driver = Dlpc350(device) if chip == "DLPC350" else Dlpc900(device, dmd_model(name))
+    try:
+        status = driver.look()
+    except DeviceLost as error:
+        if "another program" in str(error):
+            return _busy("projector", f"{chip}{place} is busy", node)
+        return Finding("bad", "projector", str(error), "unplug it and plug it in again")
+    except DeviceTimeout as error:
+        remedy = "switch it off and on again"
+        return Finding("bad", "projector", f"{chip}{place} does not answer: {error}", remedy)
+    except SlError as error:
+        return Finding("bad", "projector", str(error), "correct dmd_model, or see docs/dlpc350.md")
+    text = f"{name} on a {chip}{place}, firmware {status.firmware}, {status.power}"
+    if status.problems:
+        remedy = "switch it off and on; if it says so again, check the DMD's cable and supply"
+        return Finding("bad", "projector", f"{text}: {'; '.join(status.problems)}", remedy)
+    return Finding("ok", "projector", text + (", showing patterns" if status.running else ""))
+
+
+# -- stage ----------------------------------------------------------------------------------------
+
+
+def stage(parameters: dict[str, Any], running: bool) -> list[Finding]:
+    """The stage's port: there, permitted, free; and what answers on it."""
+    kind, port = parameters.get("kind", "grbl"), parameters.get("port", "")
+    if kind == "manual":
+        return [Finding("ok", "stage", "moved by hand, confirmed by stage/confirm")]
+    found = [Finding("note", "serial ports", _ports() or "none on this machine")]
+    if not port:
+        remedy = "put port: into the configuration, or require_pose: false for a rig without stage"
+        return [*found, Finding("note", "stage", "the configuration names no port", remedy)]
+    node = Path(port)
+    if not node.exists():
+        remedy = "plug it in and switch it on, or name one of the ports above in the configuration"
+        return [*found, Finding("bad", "stage", f"no port {port}", remedy)]
+    if not _may_use(node):
+        text = f"you have no permission for {port}"
+        return [*found, Finding("bad", "stage", text, _join_group(node))]
+    return [*found, _stage_state(kind, node, parameters, running)]
+
+
+def _ports() -> str:
+    """Serial ports with the names that stay when they are plugged in elsewhere."""
+    names = {str(link.resolve()): link for link in SERIAL_NAMES.glob("*")}
+    ports = serial_ports().items()
+    return ", ".join(f"{port} ({names.get(port, description)})" for port, description in ports)
+
+
+def _stage_state(kind: str, node: Path, parameters: dict[str, Any], running: bool) -> Finding:
+    if running:
+        return Finding("ok", "stage", f"{kind} at {node}, the running graph has it")
+    if _holders(node.resolve()):
+        return _busy("stage", f"{node} is busy", node.resolve())
+    driver = _stage_driver(kind, str(node), parameters)
+    try:
+        driver.open()
+        state = driver.state()
+    except DeviceTimeout as error:
+        remedy = "is it switched on? is it this port (see above), this baud and this kind?"
+        return Finding("bad", "stage", f"{node} is there, but no {kind} stage: {error}", remedy)
+    except DeviceLost as error:
+        return _busy("stage", str(error), node.resolve())
+    except SlError as error:
+        return Finding("bad", "stage", str(error), "correct kind and port in the configuration")
+    finally:
+        driver.close()
+    text = f"{kind} at {node}, {state.kind}{f': {state.text}' if state.text else ''}"
+    if state.kind == "alarm":
+        remedy = "take the cause away, then call the service stage/clear of the graph"
+        return Finding("bad", "stage", text, remedy)
+    if state.kind == "not_homed":
+        remedy = "call the service stage/home of the graph, or say home_at_start: true"
+        return Finding("note", "stage", text, remedy)
+    return Finding("ok", "stage", text)
+
+
+def _stage_driver(kind: str, port: str, parameters: dict[str, Any]) -> StageDriver:
+    baud = int(parameters.get("baud", 115200))
+    if kind == "zaber":
+        where = (
+            parameters.get("zaber_devices", (1, 2, 3)),
+            parameters.get("zaber_axes", (1, 1, 1)),
+        )
+        return ZaberStage(port, zaber_axes(*where), baud=baud)
+    return GrblStage(port, baud=baud, reply_timeout_s=STAGE_TIMEOUT_S)
+
+
+# -- camera ---------------------------------------------------------------------------------------
+
+
+def camera(parameters: dict[str, Any], running: bool) -> list[Finding]:
+    """The camera that the configuration names, and those that answer."""
+    address = str(parameters.get("address", ""))
+    if not address:
+        remedy = "put its address into the configuration (docs/cameras.md)"
+        return [Finding("note", "camera", "no address in the configuration", remedy), _aravis()]
+    try:
+        make_camera(address)
+    except SlError as error:
+        return [Finding("bad", "camera", str(error), "correct the configuration")]
+    kind, _, place = address.rpartition(":")
+    if kind == "aravis":
+        return [_genicam(place)]
+    if kind == "uvc":
+        return [_video(place, running), _aravis()]
+    if not Path(place).exists():
+        remedy = "start the process that serves the camera, or correct the configuration"
+        return [Finding("bad", "camera", f"nothing at {place}", remedy), _aravis()]
+    return [Finding("ok", "camera", address), _aravis()]
+
+
+def _aravis() -> Finding:
+    try:
+        found = ", ".join(list_cameras())
+    except SlError:
+        return Finding("note", "Aravis", "not installed; only cameras over GenICam need it")
+    return Finding("note", "Aravis", f"GenICam cameras that answer: {found or 'none'}")
+
+
+def _genicam(name: str) -> Finding:
+    try:
+        found = find_camera(load_aravis(), name)
+        others = ", ".join(list_cameras())
+    except DeviceLost as error:
+        remedy = (
+            "arv-tool-0.8 (package aravis-tools-cli) lists what answers; GigE: an address in the "
+            "camera's network, UDP let in; USB3: 61-sl-camera.rules (docs/cameras.md)"
+        )
+        return Finding("bad", "camera", str(error), remedy)
+    except SlError as error:
+        return Finding(
+            "bad", "camera", str(error).removesuffix(f"; {ARAVIS_INSTALL}"), ARAVIS_INSTALL
+        )
+    return Finding("ok", "camera", f"{found} (answering: {others or 'none'})")
+
+
+def _video(device: str, running: bool) -> Finding:
+    path = Path(f"/dev/video{device}") if device.isdigit() else Path(device)
+    if not path.exists():
+        there = ", ".join(map(str, sorted(Path("/dev").glob("video*")))) or "none"
+        remedy = "plug it in, or name another (v4l2-ctl --list-devices)"
+        return Finding("bad", "camera", f"no {path}; there are: {there}", remedy)
+    if not _may_use(path):
+        text = f"you have no permission for {path}"
+        return Finding("bad", "camera", text, _join_group(path))
+    if not running and _holders(path.resolve()):
+        return _busy("camera", f"{path} is busy", path.resolve())
+    return Finding("ok", "camera", str(path))

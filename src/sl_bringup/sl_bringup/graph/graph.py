@@ -1,0 +1,247 @@
+"""A graph of this machine: its nodes and its bench as supervised processes."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import IO, NoReturn
+
+from sl_bringup.graph.graph_config import (
+    TRUE_RIG,
+    Changes,
+    find_config,
+    runtime_directory,
+    started_nodes,
+    write_config,
+)
+from sl_bringup.graph.supervisor import Process, Supervisor
+from sl_bringup.graph.transport import Transport, clean_stale_segments, process_environment
+from sl_common.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class GraphOptions:
+    """What a graph is started with.
+
+    Parameters
+    ----------
+    bench : bool
+        On the simulated bench instead of hardware.
+    config : Path or None
+        Configuration file; None: the one that comes with the package.
+    changes : Changes
+        What this start changes about it.
+    domain : int
+        ROS domain.
+    network : bool
+        Open to other machines.
+    """
+
+    bench: bool = False
+    config: Path | None = None
+    changes: Changes = field(default_factory=Changes)
+    domain: int = 0
+    network: bool = False
+
+    @property
+    def source(self) -> Path:
+        """The configuration file in use."""
+        return self.config or find_config("bench.yaml" if self.bench else "hardware.yaml")
+
+    @property
+    def nodes(self) -> dict[str, str]:
+        """Nodes of the graph and their modules."""
+        return started_nodes(self.source)
+
+    @property
+    def directory(self) -> Path:
+        """The graph's runtime directory."""
+        return runtime_directory(self.domain)
+
+    @property
+    def transport(self) -> Transport:
+        """How its processes talk."""
+        return Transport(self.directory, self.domain, self.network)
+
+
+def client_command(module: str, options: GraphOptions, *arguments: str) -> tuple[str, ...]:
+    """Command of a ROS client of the graph."""
+    namespace = options.changes.namespace
+    return (sys.executable, "-m", module, "--namespace", namespace, *arguments)
+
+
+def client_environment(options: GraphOptions) -> dict[str, str]:
+    """Environment of a ROS client of the graph."""
+    return process_environment(options.transport.environment())
+
+
+def exec_client(module: str, options: GraphOptions, *arguments: str) -> NoReturn:
+    """Replace this process by a ROS client of the graph, so that signals reach it directly."""
+    command = client_command(module, options, *arguments)
+    sys.stdout.flush()
+    os.execve(command[0], command, client_environment(options))
+
+
+class Graph:
+    """A running graph; an asynchronous context manager.
+
+    Parameters
+    ----------
+    options : GraphOptions
+        What it is started with.
+    tell : callable
+        Gets every line of its processes.
+    """
+
+    def __init__(self, options: GraphOptions, tell: Callable[[str], None]) -> None:
+        self._options = options
+        self._tell = tell
+        self.supervisor = Supervisor(tell)
+        self._bench_ready = asyncio.Event()
+        self._lock: IO[str] | None = None
+        self._client: asyncio.subprocess.Process | None = None
+
+    async def __aenter__(self) -> Graph:
+        """Start all processes.
+
+        Raises
+        ------
+        ConfigError
+            When the configuration cannot be used, or a graph of this domain runs already.
+        """
+        self._lock = lock_directory(self._options.directory)
+        try:
+            clean_stale_segments()
+            config = self._write_config()
+            if self._options.bench:
+                self._start_bench(config)
+            for name, module in self._options.nodes.items():
+                self._start_node(name, module, config)
+        except BaseException:
+            await self._stop()
+            raise
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        await self._stop()
+
+    async def ready(self, timeout_s: float) -> bool:
+        """Wait until bench, nodes and services are up; each thing that is missing is told.
+
+        Parameters
+        ----------
+        timeout_s : float
+            Give up after so long; 0: never.
+        """
+        wanted = ("--nodes", *self._options.nodes, "--timeout", f"{timeout_s}")
+        if await self.run_client("sl_bringup.ready_node", *wanted) != 0:
+            return False
+        if self._options.bench:
+            try:
+                await asyncio.wait_for(self._bench_ready.wait(), timeout_s or None)
+            except TimeoutError:
+                self._tell("graph not ready: the bench does not answer")
+                return False
+        return True
+
+    async def run_client(self, module: str, *arguments: str) -> int:
+        """Run a ROS client of this graph to its end, return its exit status."""
+        self._client = await asyncio.create_subprocess_exec(
+            *client_command(module, self._options, *arguments),
+            env=client_environment(self._options),
+            stdin=asyncio.subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        try:
+            return await self._client.wait()
+        finally:
+            await self._end_client()
+
+    async def _end_client(self) -> None:
+        """Interrupt the client when the wait for it was given up."""
+        client, self._client = self._client, None
+        if client is None or client.returncode is not None:
+            return
+        with contextlib.suppress(ProcessLookupError):
+            client.terminate()
+        try:
+            await asyncio.wait_for(client.wait(), 5.0)
+        except TimeoutError:
+            client.kill()
+
+    async def _stop(self) -> None:
+        await self.supervisor.stop()
+        if self._lock:
+            self._lock.close()
+
+    def _write_config(self) -> Path:
+        config = write_config(self._options.source, self._options.directory, self._options.changes)
+        if self._options.bench and not self._options.changes.uncalibrated:
+            # Imported late: hardware does without it, and every process waits for this.
+            from sl_bench.process.bench_settings import read_settings
+            from sl_bench.world.true_rig import write_rig
+
+            write_rig(self._options.directory / TRUE_RIG, read_settings(config).make_rig())
+        return config
+
+    def _start_bench(self, config: Path) -> None:
+        def listen(line: str) -> None:
+            if line.strip() == "bench ready":
+                self._bench_ready.set()
+
+        directory = str(self._options.directory)
+        command = (sys.executable, "-m", "sl_bench.process.bench", "--config", str(config),
+                   "--runtime-dir", directory)  # fmt: skip
+        self.supervisor.start(Process("bench", command, process_environment({}), listen))
+
+    def _start_node(self, name: str, module: str, config: Path) -> None:
+        command = (sys.executable, "-m", module, "--ros-args", "--params-file", str(config),
+                   *self._options.changes.ros_args)  # fmt: skip
+        environment = process_environment(self._options.transport.environment(name))
+        self.supervisor.start(Process(name, command, environment))
+
+
+def lock_directory(directory: Path) -> IO[str]:
+    """Hold the directory for one graph; closing the file, or the end of the process, frees it.
+
+    Raises
+    ------
+    ConfigError
+        When another graph holds it.
+    """
+    file = (directory / "lock").open("a+")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.seek(0)
+        holder = file.read().strip() or "unknown"
+        file.close()
+        raise ConfigError(
+            f"a graph runs already in this domain (process {holder}, {directory}); stop it, or "
+            "choose another with --domain"
+        ) from None
+    file.truncate(0)
+    file.write(f"{os.getpid()}\n")
+    file.flush()
+    return file
+
+
+def is_running(directory: Path) -> bool:
+    """Whether a supervised graph holds the directory."""
+    try:
+        lock_directory(directory).close()
+    except ConfigError:
+        return True
+    return False

@@ -1,0 +1,1 @@
+"""What a scan or an evaluation leaves: files, pictures, reports, tables."""

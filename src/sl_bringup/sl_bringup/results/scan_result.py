@@ -1,0 +1,180 @@
+"""What becomes of a live scan: its report, its files, and the lines that its user reads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_bringup.graph.version import software_version
+from sl_bringup.results.paper_tables import table_2_lines
+from sl_bringup.results.report import micrometres, write_json, write_page
+from sl_bringup.results.scan_files import write_scan
+from sl_reconstruct.cloud.cloud import CLOUD_DTYPE, Cloud
+from sl_reconstruct.cloud.cloud_writer import cloud_hash
+from sl_reconstruct.cloud.refusals import Reason
+from sl_reconstruct.measure.groove import measure_groove
+from sl_reconstruct.measure.plane_angle import AngleMeasurement
+from sl_reconstruct.measure.result import rounded
+
+MEASURES = ("groove",)
+
+
+def live_report(answer: Mapping[str, Any], success: bool, message: str) -> dict[str, Any]:
+    """Report of a scan, from the fields of the action's `ScanReport`.
+
+    Parameters
+    ----------
+    answer : mapping
+        Fields of the message by name; ``refused`` as counts by reason.
+    success : bool
+        Whether there is a cloud.
+    message : str
+        What the graph said about it.
+    """
+    lit = answer["lit_positions"]
+    keys = ("edge_sigma_px", "edge_bound_px", "edge_blur_px")
+    figures = {key: answer[key] for key in keys}
+    if answer["edge_bound_px"] > 0:
+        figures["bound_ratio"] = answer["edge_sigma_px"] / answer["edge_bound_px"]
+    return {
+        "format": 1,
+        "bag": "live",
+        "good": success,
+        "reasons": [] if success else [message],
+        "message": message,
+        **{key: value for key, value in answer.items() if key not in keys},
+        "present_fraction": answer["points"] / lit if lit else 0.0,
+        "figures": figures,
+        "software": software_version(),
+    }
+
+
+def write_result(
+    folder: Path,
+    report: dict[str, Any],
+    points: NDArray[Any] | None,
+    measure: str,
+    pictures: bool,
+    reason: NDArray[np.uint8] | None = None,
+) -> None:
+    """Write cloud, height map, pictures, ``report.json`` and ``report.html``.
+
+    Parameters
+    ----------
+    folder : Path
+        For the files.
+    report : dict
+        From `live_report`; gets what is measured here.
+    points : ndarray or None
+        Organised cloud as published; None when there is none.
+    measure : str
+        Feature that is looked for, one of `MEASURES`, or empty.
+    pictures : bool
+        Whether pictures and the page are made.
+    reason : ndarray, (rows, columns), uint8, optional
+        Map of the refusals as published; without it, it is not drawn.
+    """
+    cloud = None if points is None else _cloud(points, report, reason)
+    with ThreadPoolExecutor(1) as beside:
+        found = beside.submit(_measured, points, measure)
+        drawn = write_scan(folder, report, cloud, pictures)
+    report.update(found.result())
+    write_json(folder / "report.json", report)
+    if pictures:
+        write_page(folder / "report.html", report, drawn)
+
+
+def _measured(points: NDArray[Any] | None, measure: str) -> dict[str, Any]:
+    """Fields of the report that are measured on the cloud."""
+    if points is None:
+        return {}
+    extents = [float(np.nanmax(v) - np.nanmin(v)) for v in (points["x"], points["y"])]
+    groove = {"groove": _groove(measure_groove(points))} if measure == "groove" else {}
+    return {"area_m": extents, **groove}
+
+
+def check_cloud(points: NDArray[Any], report: Mapping[str, Any]) -> str:
+    """Empty when the cloud is the one that the report is about, else what is wrong."""
+    found = cloud_hash(points)
+    if found == report["cloud_hash"]:
+        return ""
+    return f"cloud received has the hash {found[:12]}, the report {report['cloud_hash'][:12]}"
+
+
+def _cloud(
+    points: NDArray[Any], report: Mapping[str, Any], reason: NDArray[np.uint8] | None
+) -> Cloud:
+    """Cloud as far as messages tell it."""
+    if reason is None or reason.shape != points.shape:
+        there = np.isfinite(points["z"])
+        reason = np.where(there, Reason.PRESENT, Reason.UNLIT).astype(np.uint8)
+    nothing = np.full(points.shape, np.nan, np.float32)
+    refused = dict(report["refused"])
+    return Cloud(points.astype(CLOUD_DTYPE, copy=False), nothing, reason, refused,
+                 report["lit_positions"])  # fmt: skip
+
+
+def _groove(found: AngleMeasurement | None) -> dict[str, Any]:
+    if found is None:
+        return {"found": False}
+    planes = {
+        name: {"normal": p.normal, "point_m": p.point_m, "rms_m": p.rms_m, "points": p.points}
+        for name, p in (("left", found.first), ("right", found.second))
+    }
+    return {
+        "found": True,
+        "included_angle_deg": found.value,
+        "u_included_angle_deg": found.uncertainty,
+        **planes,
+    }
+
+
+def summary(report: Mapping[str, Any]) -> Iterator[str]:
+    """Lines that tell a person what was measured."""
+    if not report["good"]:
+        yield f"no cloud: {report['message']}"
+        return
+    yield (
+        f"points            {report['points']:,} of {report['lit_positions']:,} lit positions "
+        f"({100 * report['present_fraction']:.2f} %)"
+    )
+    yield f"sigma of z        {micrometres(report['median_sigma_m'])} (median of the stated ones)"
+    if "bound_ratio" in report["figures"]:
+        ratio = report["figures"]["bound_ratio"]
+        yield f"edge noise        {ratio:.3f} x the bound for white noise"
+    refused = {k: v for k, v in report["refused"].items() if v}
+    listed = ", ".join(f"{count:,} {reason}" for reason, count in refused.items())
+    yield f"refused           {listed or 'none'}"
+    yield (
+        f"time              {report['acquisition_s']:.2f} s acquisition, "
+        f"{report['processing_s']:.2f} s from the last image to the cloud, "
+        f"{report['attempts']} attempt{'s' if report['attempts'] > 1 else ''}"
+    )
+    for number, why in enumerate(report["attempt_messages"], start=1):
+        yield f"  attempt {number}       thrown away: {why}"
+    yield from _groove_lines(report)
+
+
+def _groove_lines(report: Mapping[str, Any]) -> Iterator[str]:
+    groove = report.get("groove")
+    if groove is None:
+        return
+    if not groove["found"]:
+        yield "groove            none found: no two flanks of different slope"
+        return
+    for side in ("left", "right"):
+        plane = groove[side]
+        x, y, z = plane["normal"]
+        yield (
+            f"{side + ' flank':<18}normal ({x:+.5f}, {y:+.5f}, {z:+.5f}), "
+            f"rms {micrometres(plane['rms_m'])}, {plane['points']:,} points"
+        )
+    angle, u = groove["included_angle_deg"], groove["u_included_angle_deg"]
+    yield f"included angle    {rounded(angle, u)} degrees (standard uncertainty, of noise)"
+    yield ""
+    yield from table_2_lines(report)

@@ -1,0 +1,251 @@
+"""What a calibration asks of the graph: move the stage, project, bring the images.
+
+Not a node of its own; it works for the calibration's node, in a thread beside the executor's.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from geometry_msgs.msg import Point, PoseStamped
+from sl_interfaces.msg import MatchedFrame, PatternStack
+from sl_interfaces.srv import MoveStage
+from std_srvs.srv import Trigger
+
+from sl_calibration.data.session import Place, RunCancelled, Taken, in_words
+from sl_common.base_node import EVENTS, LARGE, RigNode, next_scan_id
+from sl_common.errors import CalibrationError, DeviceError, DeviceTimeout, SlError
+from sl_projector.sequence.messages import stamp_from_msg
+from sl_reconstruct.messages import stack_from_msg
+from sl_reconstruct.projector_client_node import ProjectorClient
+from sl_reconstruct.scan.scan_flow import ScanRequest, ScanRun, ScanTimeouts, ScanWatch
+
+#: A stage that is there answers a question about its travel within this.
+_ANSWER_S = 5.0
+_POLL_S = 0.02
+#: Pause before a spoilt stack is repeated, longer each time: what spoilt it is to be over.
+REST_S = 2.0
+#: Publishers and services of a graph that has just started are found within this.
+_DISCOVERY_S = 10.0
+
+
+class GraphDevices:
+    """Drives stage and projector by their services and listens to the synchroniser.
+
+    It is `session.CalibrationDevices`, and `scan_flow.ScanDevices` of its own scans.
+
+    Parameters
+    ----------
+    node : RigNode
+        Whose clients and subscriptions these are.
+    """
+
+    def __init__(self, node: RigNode) -> None:
+        self._node = node
+        group = node.long_work
+        self._move = node.create_client(MoveStage, "stage/move", callback_group=group)
+        self._stop_stage = node.create_client(Trigger, "stage/stop", callback_group=group)
+        self._projector = ProjectorClient(node, group)
+        self._watch: ScanWatch | None = None
+        self._last_id = 0
+        self._cancelled: Callable[[], bool] = lambda: False
+        self._pose_ns = 0
+        self.move_timeout_s = 120.0
+        self.settle_s = 0.2
+        self.max_repeats = 2
+        self.timeouts = ScanTimeouts()
+
+    @contextmanager
+    def in_use(self, cancelled: Callable[[], bool]) -> Iterator[GraphDevices]:
+        """Listen to the synchroniser for one run; its stacks are too large to listen always."""
+        self._cancelled = cancelled
+        subscriptions = [
+            self._node.subscribe(MatchedFrame, "synchronizer/frame", self._on_frame, EVENTS),
+            self._node.subscribe(PatternStack, "synchronizer/stack", self._on_stack, LARGE),
+            self._node.subscribe(PoseStamped, "stage/pose", self._on_pose, EVENTS),
+        ]
+        try:
+            self._await_publishers(subscriptions)
+            yield self
+        finally:
+            self._watch = None
+            self._forget(subscriptions)
+
+    def _await_publishers(self, subscriptions: list[Any]) -> None:
+        end_s = time.monotonic() + _DISCOVERY_S
+        while not all(s.get_publisher_count() for s in subscriptions):
+            if time.monotonic() > end_s:
+                missing = [s.topic_name for s in subscriptions if not s.get_publisher_count()]
+                raise CalibrationError(
+                    f"nobody publishes {' and '.join(missing)}: are synchronizer and stage running?"
+                )
+            self._pause()
+
+    def _forget(self, subscriptions: list[Any]) -> None:
+        """End the subscriptions in the executor's thread, where nobody uses them meanwhile."""
+        executor = self._node.executor
+        if executor is None or not self._node.context.ok():
+            return
+        done = threading.Event()
+
+        def destroy() -> None:
+            for subscription in subscriptions:
+                self._node.destroy_subscription(subscription)
+            done.set()
+
+        executor.create_task(destroy)
+        done.wait(_ANSWER_S)
+
+    def _pause(self) -> None:
+        if self._cancelled():
+            raise RunCancelled("calibration cancelled")
+        time.sleep(_POLL_S)
+
+    # -- stage ----------------------------------------------------------------------------------
+
+    def where(self) -> Place:
+        """Where the stage stands now, metres."""
+        return _position(self._ask((0.0, 0.0, 0.0), relative=True, check_only=True).pose)
+
+    def check(self, place: Place) -> None:
+        """Refuse a place outside the travel."""
+        try:
+            self._ask(place, check_only=True)
+        except DeviceError as error:
+            raise CalibrationError(
+                f"the stage does not reach {in_words(place)}: {error}"
+            ) from error
+
+    def move(self, place: Place) -> Place:
+        """Move, and wait until the stage has told anew that it stands.
+
+        Exposures are matched with the poses told before and after them; one from before the
+        move would make the synchroniser believe that the stage moved meanwhile.
+        """
+        reply = self._ask(place)
+        settled_ns = stamp_from_msg(reply.pose.header.stamp) + round(self.settle_s * 1e9)
+        end_s = time.monotonic() + self.settle_s + _ANSWER_S
+        while self._pose_ns < settled_ns:
+            if time.monotonic() > end_s:
+                raise DeviceTimeout("stage/pose is silent: is the stage node running?")
+            self._pause()
+        return _position(reply.pose)
+
+    def _on_pose(self, message: Any) -> None:
+        self._pose_ns = stamp_from_msg(message.header.stamp)
+
+    def _ask(self, place: Place, relative: bool = False, check_only: bool = False) -> Any:
+        """Ask the stage node; what it refuses is raised with its reason."""
+        if not self._move.wait_for_service(timeout_sec=_DISCOVERY_S):
+            raise DeviceError("nobody offers stage/move: is the stage node running?")
+        x, y, z = place
+        request = MoveStage.Request(
+            target=Point(x=x, y=y, z=z), relative=relative, check_only=check_only
+        )
+        patience_s = _ANSWER_S if check_only else self.move_timeout_s
+        reply = self._answer(self._move.call_async(request), patience_s, "stage/move")
+        if not reply.success:
+            raise DeviceError(reply.message)
+        return reply
+
+    def _answer(self, future: Any, patience_s: float, service: str) -> Any:
+        end_s = time.monotonic() + patience_s
+        while not future.done():
+            if time.monotonic() > end_s:
+                raise DeviceTimeout(f"{service} did not answer within {patience_s:g} s")
+            self._pause()
+        return future.result()
+
+    def halt(self) -> None:
+        """Stop stage and projector; their answers are of no interest."""
+        if not self._node.context.ok():
+            return
+        if self._stop_stage.service_is_ready():
+            self._stop_stage.call_async(Trigger.Request())
+        self._projector.stop()
+
+    # -- images ---------------------------------------------------------------------------------
+
+    def take(self, sequence: str) -> Taken:
+        """Project a sequence; spoilt attempts are repeated."""
+        order = ScanRequest(sequence, 0.0, self.max_repeats, REST_S)
+        result = ScanRun(self, order, lambda _: None, self._cancelled, self.timeouts).run()
+        self._watch = None
+        if result.cancelled:
+            raise RunCancelled("calibration cancelled")
+        if not result.success:
+            raise CalibrationError(f"no images: {result.message}")
+        taken: Taken = result.report
+        return taken
+
+    def _on_frame(self, message: Any) -> None:
+        watch = self._watch
+        if watch is None or message.scan_id != watch.scan_id:
+            return
+        if message.status == MatchedFrame.MATCHED:
+            watch.matched(message.index, message.count)
+        elif message.status in (MatchedFrame.STACK_COMPLETE, MatchedFrame.STACK_REFUSED):
+            watch.decided(message.status == MatchedFrame.STACK_COMPLETE, message.reason)
+        else:
+            watch.sign()
+
+    def _on_stack(self, message: Any) -> None:
+        watch = self._watch
+        if watch is None or message.scan_id != watch.scan_id:
+            return
+        watch.arrived()
+        try:
+            watch.finished(_taken(message))
+        except SlError as error:
+            watch.finished(error)
+
+    # -- what a scan needs (`scan_flow.ScanDevices`) ----------------------------------
+
+    def begin(self) -> ScanWatch:
+        """Take a number that no scan had."""
+        self._last_id = next_scan_id(self._last_id)
+        self._watch = ScanWatch(self._last_id)
+        return self._watch
+
+    def missing(self, patience_s: float) -> str:
+        """Name what a scan cannot do without and nobody offers, even after a while."""
+        end_s = time.monotonic() + patience_s
+        while (gap := self._gap()) and time.monotonic() < end_s and not self._cancelled():
+            time.sleep(_POLL_S)
+        return gap
+
+    def _gap(self) -> str:
+        if gap := self._projector.gap():
+            return gap
+        if not self._node.count_publishers("camera/image_raw"):
+            return "nobody publishes camera/image_raw: is the camera node running?"
+        return ""
+
+    def project(self, watch: ScanWatch, order: ScanRequest) -> None:
+        """Ask the projector; the watch is told when it has answered."""
+        self._projector.project(watch, order)
+
+    def stop_projecting(self) -> None:
+        """Ask the projector to stop."""
+        self._projector.stop()
+
+
+def _taken(message: Any) -> Taken:
+    """Images and pose of a stack; a stack without a pose is of no use here."""
+    stack = stack_from_msg(message)
+    if not message.stage_pose.header.frame_id:
+        raise CalibrationError(
+            f"the stack of scan {message.scan_id} has no stage pose; expected one: set the "
+            "synchronizer's parameter require_pose"
+        )
+    x, y, z = _position(message.stage_pose)
+    return Taken(stack.take_images(), stack.sequence, z, (x, y), int(message.scan_id))
+
+
+def _position(stamped: Any) -> Place:
+    position = stamped.pose.position
+    return float(position.x), float(position.y), float(position.z)

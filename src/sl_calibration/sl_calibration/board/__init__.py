@@ -1,0 +1,1 @@
+"""Calibration on a chessboard in free poses, without plate or stage."""

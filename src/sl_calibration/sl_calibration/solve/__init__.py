@@ -1,0 +1,1 @@
+"""The solution: linear step, image centre, bundle adjustment, uncertainty, checks."""

@@ -1,0 +1,400 @@
+"""The full bundle over all parameters: one device, or camera and projector together.
+
+Unknown are, of each device, f (or fx, fy), C, kappa, R and T; of the stage, its true directions
+and scales (and, where its readings are not trusted, each position); of the flat that patterns
+fall on, its offset and slopes against the plate. The world is held by the plate: where it lies
+when the stage reads zero, and its pitch, are the reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_calibration.data.observations import Holes, Targets
+from sl_calibration.solve.derivatives import (
+    PARAMETERS,
+    intersect,
+    kappa_of,
+    meet,
+    moved,
+    project,
+)  # fmt: skip
+from sl_calibration.solve.robust_lm import solve
+from sl_calibration.solve.stage_model import (
+    StagePrior,
+    StageReport,
+    axis_priors,
+    moving_axes,
+    stage_report,
+)  # fmt: skip
+from sl_reconstruct.model.calibration_file import Covariance
+from sl_reconstruct.model.rig import Device
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FlatPrior:
+    """How well the flat under the patterns is known against the plate, 1-sigma each.
+
+    Parameters
+    ----------
+    offset_sigma_m : float
+        Height of its surface over the plate's, at the world's origin, metres.
+    slope_sigma : float
+        Slope along x and y, metres per metre.
+    """
+
+    offset_sigma_m: float = 1e-3
+    slope_sigma: float = 0.05
+
+
+@dataclass(frozen=True)
+class HeldLens:
+    """The lens of a device that a solution is not to change.
+
+    Parameters
+    ----------
+    name : {"camera", "projector"}
+        The device.
+    values : ndarray, (4,)
+        Focal length (px), image centre (px, px), kappa (px^-2).
+    """
+
+    name: str
+    values: Array
+
+
+#: What a held lens may move by: millionths of what any calibration can tell.
+_HELD = np.array([1e-5, 1e-5, 1e-5, 1e-16])
+
+
+def lens_values(device: Device) -> Array:
+    """Focal length, image centre and kappa (4,) of a device with square pixels."""
+    return np.array([device.focal_length_px[0], *device.image_centre_px, kappa_of(device)])
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """What the bundle estimates besides the devices.
+
+    Parameters
+    ----------
+    stage : StagePrior
+        How far the stage is trusted.
+    flat : FlatPrior or None
+        None where the patterns fall on the plate itself.
+    square_pixels : bool
+        One focal length (the paper's), or fx and fy.
+    held : HeldLens or None
+        The lens that stays as it is; for square pixels only.
+    """
+
+    stage: StagePrior = field(default_factory=StagePrior)
+    flat: FlatPrior | None = None
+    square_pixels: bool = True
+    held: HeldLens | None = None
+
+
+class State(NamedTuple):
+    """Everything that the bundle changes.
+
+    ``devices``: camera, or camera and projector; ``axes`` (3, 3), the stage's A; ``errors_m``
+    (K, 3) of its positions; ``flat``: offset (metres) and slopes along x and y.
+    """
+
+    devices: tuple[Device, ...]
+    axes: Array
+    errors_m: Array
+    flat: Array
+
+
+@dataclass(frozen=True)
+class RigProblem:
+    """Residuals and derivatives of holes and targets by all parameters.
+
+    Parameters
+    ----------
+    names : tuple of str
+        The devices', for the parameters' names: camera, or camera and projector.
+    holes : Holes
+        Seen by the first device.
+    targets : Targets
+        Named by the first and the second device.
+    freedom : Freedom
+        What is estimated.
+    """
+
+    names: tuple[str, ...]
+    holes: Holes
+    targets: Targets
+    freedom: Freedom
+
+    @property
+    def groups(self) -> Sequence[slice]:
+        """Holes and targets."""
+        holes = len(self.holes.pixels)
+        return slice(0, holes), slice(holes, holes + len(self.targets.pixels))
+
+    @cached_property
+    def positions_m(self) -> Array:
+        """The stage's positions (K, 3), each once."""
+        both = np.concatenate([self.holes.stage_m, self.targets.stage_m])
+        return np.unique(both, axis=0)
+
+    @cached_property
+    def moving(self) -> tuple[int, ...]:
+        """Axes of the stage that are estimated."""
+        return () if self.freedom.stage.held else moving_axes(self.positions_m)
+
+    @property
+    def device_size(self) -> int:
+        """Number of a device's parameters."""
+        return PARAMETERS - self.freedom.square_pixels
+
+    def chosen(self, by_device: Array) -> Array:
+        """Derivatives (..., 11) by a device, as its columns have them: f is fx and fy."""
+        if not self.freedom.square_pixels:
+            return by_device
+        focal = by_device[..., :1] + by_device[..., 1:2]
+        return np.concatenate([focal, by_device[..., 2:]], axis=-1)
+
+    def device_step(self, step: Array) -> Array:
+        """Step of a device's columns, as its eleven parameters have it."""
+        return np.concatenate([step[:1], step]) if self.freedom.square_pixels else step
+
+    @cached_property
+    def columns(self) -> dict[str, slice]:
+        """Where each block of parameters stands."""
+        sizes = dict.fromkeys(self.names, self.device_size)
+        sizes["axes"] = 3 * len(self.moving)
+        sizes["errors"] = 3 * len(self.positions_m) * (self.freedom.stage.position_sigma_m > 0)
+        sizes["flat"] = 3 * (self.freedom.flat is not None)
+        ends = [int(end) for end in np.cumsum(list(sizes.values()))]
+        starts = [0, *ends[:-1]]
+        return {name: slice(a, b) for name, a, b in zip(sizes, starts, ends, strict=True)}
+
+    @property
+    def size(self) -> int:
+        """Number of parameters P."""
+        return int(self.columns["flat"].stop)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters, in order."""
+        focal = [""] if self.freedom.square_pixels else [".0", ".1"]
+        device = [f"focal_length_px{i}" for i in focal]
+        device += [f"image_centre_px.{i}" for i in range(2)] + ["kappa"]
+        device += [f"{what}.{i}" for what in ("rotation_rad", "translation_m") for i in range(3)]
+        names = [f"{name}.{parameter}" for name in self.names for parameter in device]
+        names += [f"stage.{'xyz'[axis]}_axis.{i}" for axis in self.moving for i in range(3)]
+        if self.freedom.stage.position_sigma_m > 0:
+            count = len(self.positions_m)
+            names += [f"stage.position_m.{k}.{i}" for k in range(count) for i in range(3)]
+        if self.freedom.flat is not None:
+            names += ["flat.offset_m", "flat.slope_x", "flat.slope_y"]
+        return tuple(names)
+
+    def moved(self, state: State, step: Array) -> State:
+        """State after a step."""
+        axes = state.axes.copy()
+        axes[:, list(self.moving)] += step[self.columns["axes"]].reshape(-1, 3).T
+        errors = step[self.columns["errors"]].reshape(-1, 3)
+        flat = step[self.columns["flat"]]
+        devices = tuple(
+            moved(device, self.device_step(step[self.columns[name]]))
+            for name, device in zip(self.names, state.devices, strict=True)
+        )
+        return State(
+            devices, axes, state.errors_m + errors if len(errors) else state.errors_m,
+            state.flat + flat if len(flat) else state.flat,
+        )  # fmt: skip
+
+    def start(self, *devices: Device) -> State:
+        """State with a faultless stage and the patterns on the plate's plane."""
+        return State(devices, np.eye(3), np.zeros_like(self.positions_m), np.zeros(3))
+
+    def residuals(self, state: State) -> Array:
+        """Residuals (M, 2), predicted less observed, in sigmas."""
+        points = self.holes.points_m + self._shift(state, 0)
+        parts = [(state.devices[0].project(points) - self.holes.pixels) / self.holes.sigma_px]
+        if len(self.targets.pixels):
+            normal, height, _ = self.planes(state)
+            met = meet(state.devices[0], self.targets.camera_px, normal, height)
+            difference = state.devices[1].project(met) - self.targets.pixels
+            parts.append(difference / self.targets.sigma_px)
+        return np.concatenate(parts)
+
+    def _shift(self, state: State, group: int) -> Array:
+        """How far the stage has moved each hole (0) or target (1), (N, 3)."""
+        data = (self.holes, self.targets)[group]
+        return np.asarray(data.stage_m @ state.axes.T + state.errors_m[self._places[group]])
+
+    def planes(self, state: State) -> tuple[Array, Array, Array]:
+        """Normal of the flat (3,), h of each target's plane (N,), and its shift (N, 3)."""
+        normal = np.array([-state.flat[1], -state.flat[2], 1.0])
+        shift = self._shift(state, 1)
+        return normal, state.flat[0] + shift @ normal, shift
+
+    def evaluate(self, state: State) -> tuple[Array, Array]:
+        """Residuals (M, 2), predicted less observed, in sigmas, and derivatives (M, 2, P)."""
+        parts = [self._holes(state)]
+        if len(self.targets.pixels):
+            parts.append(self._targets(state))
+        return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+
+    def _place(self, stage_m: Array) -> NDArray[np.intp]:
+        """Index of each row's stage position."""
+        apart = np.abs(stage_m[:, np.newaxis] - self.positions_m).sum(axis=2)
+        return np.asarray(np.argmin(apart, axis=1), dtype=np.intp)
+
+    @cached_property
+    def _places(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        return self._place(self.holes.stage_m), self._place(self.targets.stage_m)
+
+    def _holes(self, state: State) -> tuple[Array, Array]:
+        data, place = self.holes, self._places[0]
+        seen = project(state.devices[0], data.points_m + self._shift(state, 0))
+        jacobian = np.zeros((len(place), 2, self.size))
+        jacobian[:, :, self.columns[self.names[0]]] = self.chosen(seen.by_device)
+        self._by_shift(jacobian, seen.by_point, data.stage_m, place)
+        return _in_sigmas(seen.pixels - data.pixels, jacobian, data.sigma_px)
+
+    def _by_shift(
+        self, jacobian: Array, by_shift: Array, stage_m: Array, place: NDArray[np.intp]
+    ) -> None:
+        """Derivatives by the stage, from those by the shift (N, 2, 3) of the part."""
+        first = self.columns["axes"].start
+        for i, axis in enumerate(self.moving):
+            block = slice(first + 3 * i, first + 3 * i + 3)
+            jacobian[:, :, block] = by_shift * stage_m[:, axis, np.newaxis, np.newaxis]
+        if self.freedom.stage.position_sigma_m > 0:
+            rows = np.arange(len(place))
+            for i in range(3):
+                jacobian[rows, :, self.columns["errors"].start + 3 * place + i] = by_shift[:, :, i]
+
+    def _targets(self, state: State) -> tuple[Array, Array]:
+        data, place = self.targets, self._places[1]
+        camera, projector = state.devices
+        normal, height, shift = self.planes(state)
+        hit = intersect(camera, data.camera_px, normal, height)
+        seen = project(projector, hit.points_m)
+        by_height = np.einsum("nij,nj->ni", seen.by_point, hit.by_height)
+        jacobian = np.zeros((len(shift), 2, self.size))
+        by_camera = seen.by_point @ hit.by_device
+        jacobian[:, :, self.columns[self.names[0]]] = self.chosen(by_camera)
+        jacobian[:, :, self.columns[self.names[1]]] = self.chosen(seen.by_device)
+        self._by_shift(jacobian, by_height[:, :, np.newaxis] * normal, data.stage_m, place)
+        if self.freedom.flat is not None:
+            across = (hit.points_m - shift)[:, np.newaxis, :2]
+            level = by_height[:, :, np.newaxis]
+            jacobian[:, :, self.columns["flat"]] = np.concatenate([level, level * across], axis=2)
+        return _in_sigmas(seen.pixels - data.pixels, jacobian, data.sigma_px)
+
+    def priors(self, state: State) -> tuple[Array, Array]:
+        """Residuals (K,) of stage, flat and lens against what is known, derivatives (K, P)."""
+        parts: list[tuple[Array, Array, slice]] = []
+        stage, flat = self.freedom.stage, self.freedom.flat
+        for i, axis in enumerate(self.moving):
+            first = self.columns["axes"].start + 3 * i
+            parts.append((*axis_priors(state.axes, axis, stage), slice(first, first + 3)))
+        if stage.position_sigma_m > 0:
+            values = state.errors_m.ravel() / stage.position_sigma_m
+            scale = np.eye(len(values)) / stage.position_sigma_m
+            parts.append((values, scale, self.columns["errors"]))
+        if flat is not None:
+            sigma = np.array([flat.offset_sigma_m, flat.slope_sigma, flat.slope_sigma])
+            parts.append((state.flat / sigma, np.diag(1 / sigma), self.columns["flat"]))
+        if held := self.freedom.held:
+            first = self.columns[held.name].start
+            values = (lens_values(state.devices[self.names.index(held.name)]) - held.values) / _HELD
+            parts.append((values, np.diag(1 / _HELD), slice(first, first + 4)))
+        jacobian = np.zeros((sum(len(values) for values, _, _ in parts), self.size))
+        row = 0
+        for values, block, columns in parts:
+            jacobian[row : row + len(values), columns] = block
+            row += len(values)
+        return np.concatenate([np.empty(0), *(values for values, _, _ in parts)]), jacobian
+
+
+def _in_sigmas(difference: Array, jacobian: Array, sigma: Array) -> tuple[Array, Array]:
+    return difference / sigma, jacobian / sigma[:, :, np.newaxis]
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A solved bundle with its evidence.
+
+    Parameters
+    ----------
+    problem : RigProblem
+        What was solved: observations and freedom.
+    state : State
+        Devices, stage and flat.
+    covariance : Covariance
+        Of every parameter, by name; rotations are small turns about the device's own axes.
+    residuals_px : ndarray, (M, 2)
+        Predicted less observed, of holes, then targets, wrong ones included, pixels.
+    used : ndarray of bool, (M,)
+        False for points that were rejected as wrong.
+    chi2, dof : float, int
+        Of used points and priors with the sigmas as stated, and its degrees of freedom.
+    scales : ndarray, (2,)
+        Factors by which the sigmas of holes and targets were enlarged to agree with the residuals.
+    """
+
+    problem: RigProblem
+    state: State
+    covariance: Covariance
+    residuals_px: Array
+    used: NDArray[np.bool_]
+    chi2: float
+    dof: int
+    scales: Array
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """1-sigma of each parameter by name."""
+        values = np.sqrt(np.diag(self.covariance.matrix))
+        return dict(zip(self.covariance.parameters, map(float, values), strict=True))
+
+    @property
+    def stage(self) -> StageReport:
+        """The stage's directions and scales with their sigmas."""
+        full, problem = np.zeros((9, 9)), self.problem
+        block = problem.columns["axes"]
+        rows = np.array([3 * axis + i for axis in problem.moving for i in range(3)], dtype=int)
+        full[np.ix_(rows, rows)] = self.covariance.matrix[block, block]
+        return stage_report(self.state.axes, full, problem.moving)
+
+    @property
+    def misfit(self) -> float:
+        """Median length of all residuals in sigmas: what tells a right start from a wrong one."""
+        sigma = np.concatenate([self.problem.holes.sigma_px, self.problem.targets.sigma_px])
+        return float(np.median(np.hypot(*(self.residuals_px / sigma).T)))
+
+    def residuals_of(self, group: int) -> Array:
+        """Residuals (N, 2) of used holes (0) or targets (1), pixels."""
+        part = self.problem.groups[group]
+        return np.asarray(self.residuals_px[part][self.used[part]])
+
+    def rms_px(self, group: int) -> float:
+        """Root mean square of the residual vectors' lengths; NaN for none."""
+        residuals = self.residuals_of(group)
+        return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))) if len(residuals) else np.nan
+
+
+def solve_bundle(problem: RigProblem, start: State) -> Bundle:
+    """Solve from a start; errors as in `sl_calibration.solve.robust_lm.solve`."""
+    state, fit = solve(problem, start)
+    sigma = np.concatenate([problem.holes.sigma_px, problem.targets.sigma_px])
+    return Bundle(
+        problem, state, Covariance(problem.parameters, fit.covariance),
+        fit.residuals * sigma, fit.used, fit.chi2, fit.dof, fit.scales,
+    )  # fmt: skip

@@ -1,0 +1,1 @@
+"""The hole plate, and finding its holes in an image."""

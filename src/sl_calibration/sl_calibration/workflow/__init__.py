@@ -1,0 +1,1 @@
+"""A calibration from its request to its verdict and folder, without ROS."""

@@ -1,0 +1,335 @@
+"""A calibration from its order to its verdict and its folder. No ROS here."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sl_calibration.data.run_store import OBSERVATIONS, PAGE, Store
+from sl_calibration.data.session import (
+    CalibrationDevices,
+    CalibrationProgress,
+    CalibrationRequest,
+    RunCancelled,
+    Session,
+    Taken,
+    Tell,
+    check_motion,
+)
+from sl_calibration.data.view_extraction import observe
+from sl_calibration.data.views import Observations, View, save_observations
+from sl_calibration.report.camera_file import load_kept
+from sl_calibration.report.verification_report import write_verify_report
+from sl_calibration.solve.fixed_intrinsics import Kept, keep_of, other_than
+from sl_calibration.solve.uncertainty import Limits, judge
+from sl_calibration.target.plate import Plate
+from sl_calibration.verify.verification import (
+    Check,
+    Findings,
+    VerifyLimits,
+    check_rig_on,
+    check_target,
+    default_heights,
+    stage_z_axis,
+)
+from sl_calibration.workflow.conclude import Outcome, conclude
+from sl_common.errors import CalibrationError, SlError
+from sl_reconstruct.model.calibration_file import Calibration
+
+NAN = float("nan")
+_NO_SIDE = "not checked: no mark of this plate tells its face from its back"
+
+
+@dataclass(frozen=True)
+class Pitches:
+    """Pixel pitches of the chips, metres; they only turn pixels into millimetres in reports."""
+
+    camera_m: float
+    projector_m: float
+
+
+@dataclass(frozen=True)
+class VerifyOutcome:
+    """What became of a check; fields as the service's."""
+
+    message: str
+    success: bool = False
+    recalibrate: bool = False
+    rms_m: float = 0.0
+    limit_m: float = 0.0
+    report: str = ""
+    views: int = 0
+    flatness_m: float = NAN
+    ray_gap_m: float = NAN
+    lattice_m: float = NAN
+    pitch_error: float = NAN
+    step_m: float = NAN
+    z_scale_error: float = NAN
+
+
+@dataclass(frozen=True)
+class InForce:
+    """The calibration in force and where it comes from."""
+
+    calibration: Calibration
+    source: str
+
+
+class Calibrator:
+    """Runs calibrations and checks, and stores them.
+
+    Parameters
+    ----------
+    store : Store
+        Folder of all runs.
+    limits : Limits
+        Acceptance gate.
+    pitches : Pitches
+        Of camera and DMD.
+    stage_tolerance_m : float
+        The stage stands where it was sent within this.
+    verify_limits : VerifyLimits
+        Figures beyond which a check asks for a new calibration.
+    look : callable
+        Makes a view of a stack.
+    record : callable
+        Called with what is needed to make a run again from a recording, plain values.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        limits: Limits,
+        pitches: Pitches,
+        stage_tolerance_m: float = 5e-6,
+        verify_limits: VerifyLimits | None = None,
+        look: Callable[[Taken, CalibrationRequest], View] = observe,
+        record: Callable[[Mapping[str, Any]], None] = lambda _: None,
+    ) -> None:
+        self._store, self._limits, self._pitches = store, limits, pitches
+        self._stage_tolerance_m = stage_tolerance_m
+        self._verify_limits = verify_limits or VerifyLimits()
+        self._observe, self._record = look, record
+
+    # -- calibrate --------------------------------------------------------------------------------
+
+    def calibrate(
+        self,
+        gear: CalibrationDevices,
+        order: CalibrationRequest,
+        in_force: InForce | None,
+        tell: Tell,
+        keep: str = "",
+    ) -> Outcome:
+        """Take views, solve, judge, store; in force only when accepted.
+
+        Parameters
+        ----------
+        gear : CalibrationDevices
+            The devices.
+        order : CalibrationRequest
+            What is asked for.
+        in_force : InForce or None
+            Calibration in force: the device that is not asked for keeps its lens of it.
+        tell : callable
+            Called with each change of progress.
+        keep : str
+            Calibration file whose device is kept instead.
+
+        Returns
+        -------
+        Outcome
+            Never an `SlError`: what went wrong is its message.
+        """
+        try:
+            kept = self._kept(order.target, in_force, keep)
+            # Without a projector to be kept, a camera needs no patterns.
+            order = replace(order, patterns=order.target != "camera" or kept is not None)
+            return self._run(gear, order, kept, tell)
+        except RunCancelled as error:
+            stays = "the calibration in force stays" if in_force else "nothing is in force"
+            return Outcome(f"{error}; stage and projector were stopped, {stays}", cancelled=True)
+        except SlError as error:
+            return Outcome(str(error))
+
+    def _kept(self, target: str, in_force: InForce | None, keep: str) -> Kept | None:
+        """Lens of the device that is not asked for; None where both are, or there is none yet."""
+        if target == "both":
+            return None
+        name = other_than(target)
+        waiting = self._store.camera() if name == "camera" else None
+        if keep or waiting:
+            return load_kept(Path(keep) if keep else Path(waiting or ""), name)
+        if in_force:
+            return keep_of(in_force.calibration, name, in_force.source)
+        if target == "projector":
+            raise CalibrationError(
+                "target='projector', but no calibrated camera is in force or named; expected one: "
+                "calibrate the 'camera' first, or 'both'"
+            )
+        return None
+
+    def _run(
+        self, gear: CalibrationDevices, order: CalibrationRequest, kept: Kept | None, tell: Tell
+    ) -> Outcome:
+        stacks: list[Taken] = []
+
+        def look(taken: Taken, asked: CalibrationRequest) -> View:
+            view = self._observe(taken, asked)
+            # Sizes and number are needed later; the images would fill the memory.
+            stacks.append(replace(taken, images=np.empty((0, *taken.images.shape[1:]))))
+            return view
+
+        order, refused = _within_travel(gear, order)
+        made_from = {**made_from_order(order, kept), **refused}
+        try:
+            session = Session(gear, order, look, tell, self._stage_tolerance_m, check_motion)
+            views = session.views()
+            outcome = self._solved(views, stacks[0], made_from, tell)
+        except SlError as error:
+            self._note(stacks, made_from, Outcome(str(error)))
+            raise
+        self._note(stacks, made_from, outcome)
+        return outcome
+
+    def _solved(
+        self, views: tuple[View, ...], stack: Taken, made_from: Mapping[str, Any], tell: Tell
+    ) -> Outcome:
+        height, width = stack.images.shape[1:]
+        observations = Observations(
+            views, (width, height), stack.sequence.dmd_size, self._pitches.camera_m,
+            self._pitches.projector_m, made_from,
+        )  # fmt: skip
+        folder = self._store.new_run()
+        save_observations(folder / OBSERVATIONS, observations)
+        tell(CalibrationProgress("solve", len(views), len(views), 0.85))
+        outcome = conclude(observations, self._limits, folder, tell)
+        if outcome.camera_alone:
+            self._store.put_camera(folder)
+        elif outcome.accepted:
+            self._store.put_in_force(folder)
+        tell(CalibrationProgress("store", len(views), len(views), 1.0))
+        return outcome
+
+    def _note(self, stacks: list[Taken], made_from: Mapping[str, Any], outcome: Outcome) -> None:
+        """Say what it takes to make the run again from a recording of it."""
+        if stacks:
+            self._record(
+                {
+                    "format": 1,
+                    "scan_ids": [stack.scan_id for stack in stacks],
+                    "made_from": dict(made_from),
+                    "pitches": asdict(self._pitches),
+                    "limits": asdict(self._limits),
+                    "accepted": outcome.accepted,
+                    "hash": outcome.hash,
+                    "message": outcome.message,
+                }
+            )
+
+    # -- verify -----------------------------------------------------------------------------------
+
+    def verify(
+        self, gear: CalibrationDevices, target: str, heights_m: tuple[float, ...], plate: Plate,
+        sequence: str,
+        in_force: InForce,
+    ) -> VerifyOutcome:  # fmt: skip
+        """Check the calibration in force on plate or flat; the stage goes back where it stood.
+
+        Parameters
+        ----------
+        gear : CalibrationDevices
+            The devices.
+        target : {"plate", "flat"}
+            What lies there.
+        heights_m : tuple of float
+            Stage heights; empty: three among those of the calibration.
+        plate : Plate
+            The plate, where it is one.
+        sequence : str
+            Patterns, both axes.
+        in_force : InForce
+            What is checked; it is not changed.
+
+        Raises
+        ------
+        SlError
+            When the check cannot be made.
+        """
+        check_target(target)
+        calibration = in_force.calibration
+        heights_m = heights_m or default_heights(calibration.made_from, gear.where()[2])
+        order = CalibrationRequest("both", heights_m, plate, sequence, least=1)
+
+        def look(taken: Taken, _: CalibrationRequest) -> Check:
+            return check_rig_on(taken, target, plate, calibration.rig)
+
+        checks = Session(gear, order, look, lambda _: None, self._stage_tolerance_m).views()
+        return self._judged(Findings(checks, stage_z_axis(calibration)), calibration.hash)
+
+    def _judged(self, findings: Findings, calibration_hash: str) -> VerifyOutcome:
+        limits = self._verify_limits
+        told = {name: value for name, value in findings.figures.items() if np.isfinite(value)}
+        verdict = judge(told, limits)
+        reasons = f" ({'; '.join(verdict.reasons)})" if verdict.reasons else ""
+        advice = "the calibration in force is good" if verdict.passed else f"recalibrate{reasons}"
+        target, count = findings.checks[0].target, len(findings.checks)
+        message = (
+            f"{told['rms_m'] * 1e6:.3f} um rms on the {target} at {count} "
+            f"height{'s' * (count > 1)} (limit {limits.rms_m * 1e6:g} um): {advice}; "
+            f"{findings.words}"
+        )
+        folder = self._store.new_run("verify")
+        write_verify_report(folder, findings, limits, message, not verdict.passed, calibration_hash)
+        return VerifyOutcome(
+            message, True, not verdict.passed, limit_m=limits.rms_m, report=str(folder / PAGE),
+            views=count, z_scale_error=findings.z_scale_error, **findings.figures,
+        )  # fmt: skip
+
+
+def _within_travel(
+    gear: CalibrationDevices, order: CalibrationRequest
+) -> tuple[CalibrationRequest, dict[str, str]]:
+    """The request without the views aside where the stage cannot move so, and why it cannot."""
+    if not order.travel_m:
+        return order, {}
+    x, y, _ = gear.where()
+    try:
+        for dx, dy, z in order.places:
+            if dx or dy:
+                gear.check((x + dx, y + dy, z))
+    except SlError as error:
+        return replace(order, travel_m=0.0), {"not_square": f"squareness not measured: {error}"}
+    return order, {}
+
+
+def made_from_order(order: CalibrationRequest, kept: Kept | None = None) -> dict[str, Any]:
+    """Everything that a calibration is made from, plain values."""
+    return {
+        "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "target": order.target,
+        "heights_m": order.distinct,
+        "travel_m": order.travel_m,
+        "plate": asdict(order.plate),
+        "sequence": order.sequence,
+        "software": versions(),
+        **({"kept": kept.plain} if kept else {}),
+        **({} if order.plate.tells_its_back else {"plate_side": _NO_SIDE}),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computes a calibration."""
+    found = {}
+    for name in ("slrig", "numpy", "scipy", "opencv-python-headless", "numba"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "unknown"
+    return found

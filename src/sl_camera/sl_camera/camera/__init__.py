@@ -1,0 +1,1 @@
+"""What a camera is: frames, pixel formats, frame numbers, its clock and software triggers."""

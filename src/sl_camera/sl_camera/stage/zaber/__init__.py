@@ -1,0 +1,1 @@
+"""Zaber stages with the ASCII protocol."""

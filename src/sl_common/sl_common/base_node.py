@@ -1,0 +1,274 @@
+"""What every node of the graph shares: QoS, parameters, diagnostics, workers and `main`.
+
+It lies in this package because all others may import it. A node here never dies of a message:
+what is wrong with one becomes a count, a log line and a reply.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
+from std_msgs.msg import String
+
+from sl_common.errors import SlError
+
+NAMESPACE = "sl"
+WORLD_FRAME = "sl_world"
+CAMERA_FRAME = "sl_camera_optical"
+PROJECTOR_FRAME = "sl_projector_optical"
+
+_ResultT = TypeVar("_ResultT")
+
+
+def _qos(depth: int, latched: bool = False) -> QoSProfile:
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
+
+
+#: Triggers, poses and verdicts: small, never to be missed.
+EVENTS = _qos(1024)
+#: Images: deeper than the longest built-in sequence, on both sides.
+IMAGES = _qos(64)
+#: Stacks and clouds of 20 to 100 MB: as many as memory allows to wait.
+LARGE = _qos(4)
+#: What a late subscriber needs as well.
+LATCHED = _qos(1, latched=True)
+
+
+#: A refusal is a warning on `/diagnostics` for so long: at least two messages.
+NOTED_S = 2.5
+DIAGNOSTICS_S = 1.0
+
+
+@dataclass(frozen=True)
+class Health:
+    """What a node says about itself once a second.
+
+    Parameters
+    ----------
+    level : {"ok", "warn", "error"}
+        How bad it is.
+    message : str
+        One line.
+    component : str
+        What the status is about.
+    hardware_id : str
+        Serial number or address of the device.
+    values : dict
+        Numbers and words beside it.
+    """
+
+    level: str
+    message: str
+    component: str = "node"
+    hardware_id: str = ""
+    values: dict[str, object] = field(default_factory=dict)
+
+
+_LEVELS = {
+    "ok": DiagnosticStatus.OK,
+    "warn": DiagnosticStatus.WARN,
+    "error": DiagnosticStatus.ERROR,
+}
+
+
+def next_scan_id(last: int) -> int:
+    """Return a scan number that no scan had, not even before a restart: seconds since 1970 or more.
+
+    It fits the messages' 32 bits until 2106.
+    """
+    return max(last + 1, int(time.time()))
+
+
+def device_health(connected: bool, reason: str) -> tuple[str, str]:
+    """Level and message of a node that drives one device."""
+    return ("ok", "ready") if connected else ("error", reason)
+
+
+class RigNode(Node):  # type: ignore[misc]  # rclpy carries no types
+    """A node of the rig: relative names in namespace ``/sl``, `/diagnostics` at 1 Hz.
+
+    Parameters
+    ----------
+    name : str
+        Node name.
+    options
+        Passed to `rclpy.node.Node` (tests give a context and parameters).
+    """
+
+    def __init__(self, name: str, **options: Any) -> None:
+        super().__init__(name, namespace=NAMESPACE, **options)
+        self.counts: Counter[str] = Counter()
+        self.last_error = ""
+        self._noted_s = -math.inf
+        self.workers = ThreadPoolExecutor(4, thread_name_prefix=name)
+        self.long_work = ReentrantCallbackGroup()
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        #: Timers run on it, so that a bag's clock that stands still does not stop them.
+        self.steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(DIAGNOSTICS_S, self._publish_diagnostics, clock=self.steady)
+
+    def health(self) -> Health:
+        """Say how the node is; called once a second in the executor's thread."""
+        return Health("ok", "running")
+
+    def close(self) -> None:
+        """Give back what the node holds; called once, after the executor has stopped."""
+        self.workers.shutdown(wait=True, cancel_futures=True)
+
+    def latch_settings(self, topic: str) -> Callable[[Mapping[str, object]], None]:
+        """Return what publishes settings on a latched topic, as JSON: recordings then hold them."""
+        publisher = self.create_publisher(String, topic, LATCHED)
+
+        def tell(values: Mapping[str, object]) -> None:
+            publisher.publish(String(data=json.dumps(values, sort_keys=True)))
+
+        return tell
+
+    def declare(
+        self,
+        name: str,
+        default: Any,
+        description: str,
+        low: float | None = None,
+        high: float | None = None,
+        live: bool = False,
+    ) -> Any:
+        """Declare a parameter with its description and range, and return its value.
+
+        ``live`` parameters may be set while the node runs, the others only when it starts.
+        """
+        descriptor = ParameterDescriptor(description=description, read_only=not live)
+        if low is not None and high is not None:
+            if isinstance(default, float):
+                limits = FloatingPointRange(from_value=float(low), to_value=float(high))
+                descriptor.floating_point_range = [limits]
+            else:
+                span = IntegerRange(from_value=int(low), to_value=int(high), step=1)
+                descriptor.integer_range = [span]
+        return self.declare_parameter(name, default, descriptor).value
+
+    def subscribe(
+        self, kind: Any, topic: str, handle: Callable[[Any], None], qos: QoSProfile
+    ) -> Any:
+        """Subscribe so that no message can end the node, and lost ones are counted."""
+
+        def guarded(message: Any) -> None:
+            try:
+                handle(message)
+            except SlError as error:
+                self.complain(topic, error)
+            except Exception as error:  # a fault of ours must not stop a production line
+                self.complain(topic, error)
+                self.get_logger().error(f"internal fault on {topic}: {error!r}")
+
+        events = SubscriptionEventCallbacks(
+            message_lost=lambda event: self._count_lost(topic, event.total_count_change),
+            incompatible_qos=lambda event: self.get_logger().warning(
+                f"a publisher of {topic} offers an incompatible QoS; its messages do not come"
+            ),
+        )
+        return self.create_subscription(kind, topic, guarded, qos, event_callbacks=events)
+
+    def say(self, text: str) -> None:
+        """Log a line, also from a thread that outlives the context by a moment."""
+        if self.context.ok():
+            self.get_logger().info(text)
+
+    def note(self, text: str) -> None:
+        """Remember what was refused or failed; for a moment it makes a healthy node warn."""
+        self.last_error, self._noted_s = text, time.monotonic()
+
+    def complain(self, topic: str, error: Exception) -> None:
+        """Count and log something that was refused."""
+        self.counts[f"{topic} refused"] += 1
+        self.note(f"{topic}: {error}")
+        self.get_logger().warning(self.last_error, throttle_duration_sec=0.2)
+
+    def _count_lost(self, topic: str, lost: int) -> None:
+        self.counts[f"{topic} lost in transport"] += lost
+        self.get_logger().warning(f"{lost} messages of {topic} were lost in transport")
+
+    async def in_worker(self, work: Callable[[], _ResultT]) -> _ResultT:
+        """Await work that runs in a worker thread, while the executor goes on.
+
+        The callback that awaits must be in `long_work`, else it would block all others.
+        """
+        executor = self.executor
+        future = Future(executor=executor)
+        future.add_done_callback(lambda _: executor.wake())
+
+        def run() -> None:
+            try:
+                future.set_result(work())
+            except BaseException as error:
+                future.set_exception(error)
+
+        self.workers.submit(run)
+        return await future  # type: ignore[no-any-return]
+
+    def _publish_diagnostics(self) -> None:
+        health = self.health()
+        values = {**health.values, **self.counts}
+        level, message = health.level, health.message
+        if self.last_error:
+            values["last refusal"] = self.last_error
+        if level == "ok" and time.monotonic() - self._noted_s < NOTED_S:
+            # The node itself is well: whoever waits for it need not wait for this to pass.
+            level, message, values["passing"] = "warn", self.last_error, True
+        status = DiagnosticStatus(
+            level=_LEVELS[level],
+            name=f"{self.get_name()}: {health.component}",
+            message=message,
+            hardware_id=health.hardware_id,
+            values=[KeyValue(key=str(k), value=str(v)) for k, v in values.items()],
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+
+def run(make: Callable[[], RigNode], args: list[str] | None = None) -> None:
+    """Make a node and spin it until SIGINT or SIGTERM; the exit status is then 0.
+
+    A configuration that cannot work is one line and exit status 1.
+    """
+    node: RigNode | None = None
+    try:
+        rclpy.init(args=args)
+        node = make()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except SlError as error:
+        sys.stderr.write(f"{type(error).__name__}: {error}\n")
+        raise SystemExit(1) from None
+    finally:
+        _end(node)
+
+
+def _end(node: RigNode | None) -> None:
+    if node is not None:
+        node.close()
+        node.destroy_node()
+    rclpy.try_shutdown()

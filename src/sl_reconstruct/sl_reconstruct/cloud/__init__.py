@@ -1,0 +1,1 @@
+"""Clouds and height maps: data, refusals, files, and planes through them."""

@@ -1,0 +1,245 @@
+"""Spheres and cylinders by geometric least squares: orthogonal distances, Gauss-Newton."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sl_common.errors import StackError
+from sl_reconstruct.cloud.plane_fit import TRIM_SD, robust_sd
+from sl_reconstruct.measure.region import Selection
+from sl_reconstruct.measure.result import Fitted, Measurement, Quantity, uncertainties
+
+Array = NDArray[np.float64]
+#: Parameters to residuals (n,), their derivatives (n, p), and the normals' z (n,).
+Model = Callable[[Array, Array], tuple[Array, Array, Array]]
+
+ITERATIONS, ROUNDS = 60, 3
+#: Converged when a step changes no parameter by more than this part of the radius.
+CONVERGED = 1e-12
+
+
+@dataclass(frozen=True, kw_only=True)
+class SphereMeasurement(Measurement):
+    """A sphere; the value is its radius.
+
+    Parameters
+    ----------
+    centre_m, u_centre_m : tuple of float
+        Centre and standard uncertainties of its coordinates.
+    """
+
+    centre_m: tuple[float, ...]
+    u_centre_m: tuple[float, ...]
+
+    value_name: ClassVar[str] = "radius"
+
+    def _others(self) -> Iterator[Quantity]:
+        for axis, c, u in zip("xyz", self.centre_m, self.u_centre_m, strict=True):
+            yield Quantity(f"centre_{axis}", c, u, "m")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CylinderMeasurement(Measurement):
+    """A cylinder; the value is its radius.
+
+    Parameters
+    ----------
+    point_m : tuple of float
+        Point of the axis nearest to the points' centre.
+    direction : tuple of float
+        Unit vector along the axis, x > 0 (y > 0 where x is 0).
+    """
+
+    point_m: tuple[float, ...]
+    direction: tuple[float, ...]
+
+    value_name: ClassVar[str] = "radius"
+
+
+def measure_sphere(chosen: Selection) -> SphereMeasurement:
+    """Fit a sphere; convex and hollow ones alike.
+
+    Parameters
+    ----------
+    chosen : Selection
+        Its points; those off by more than 5 robust standard deviations are set aside.
+
+    Raises
+    ------
+    StackError
+        When the points make no sphere.
+    """
+    start = _algebraic_sphere(chosen.xyz_m)
+    values, used, residual, jacobian, normal_z = fit_rounds(_sphere, chosen, start)
+    points = chosen.at(used)
+    fit = uncertainties(jacobian, residual, points.sigma_m * np.abs(normal_z),
+                        points.xyz_m[:, :2])  # fmt: skip
+    u = np.sqrt(np.diag(fit.covariance))
+    return SphereMeasurement(
+        kind="sphere", **_of_radius(values[3], u[3], fit, chosen, points),
+        centre_m=tuple(values[:3].tolist()), u_centre_m=tuple(u[:3].tolist()),
+    )  # fmt: skip
+
+
+def measure_cylinder(chosen: Selection) -> CylinderMeasurement:
+    """Fit a cylinder that lies roughly flat; convex and hollow ones alike.
+
+    Parameters
+    ----------
+    chosen : Selection
+        Its points; those off by more than 5 robust standard deviations are set aside.
+
+    Raises
+    ------
+    StackError
+        When the points make no cylinder.
+    """
+    centre = chosen.xyz_m.mean(axis=0)
+    local = Selection(chosen.xyz_m - centre, chosen.sigma_m)
+    frame, start = _paraboloid_cylinder(local.xyz_m)
+    turned = Selection(local.xyz_m @ frame.T, local.sigma_m)
+    # In the turned frame the axis runs along x; the noise, along z of the world, does not.
+    values, used, residual, jacobian, _ = fit_rounds(_cylinder, turned, start)
+    up = _cylinder_normals(values, turned.xyz_m[used]) @ frame[:, 2]
+    points = chosen.at(used)
+    fit = uncertainties(jacobian, residual, points.sigma_m * np.abs(up), points.xyz_m[:, :2])
+    direction = np.array([1.0, values[2], values[3]]) / np.hypot(1.0, np.hypot(*values[2:4]))
+    point = np.array([0.0, values[0], values[1]])
+    point -= (point @ direction) * direction
+    direction, point = direction @ frame, point @ frame + centre
+    direction = direction if tuple(direction[:2]) > (0.0, 0.0) else -direction
+    return CylinderMeasurement(
+        kind="cylinder",
+        **_of_radius(values[4], np.sqrt(fit.covariance[4, 4]), fit, chosen, points),
+        point_m=tuple(point.tolist()), direction=tuple(direction.tolist()),
+    )  # fmt: skip
+
+
+def _of_radius(
+    radius_m: float, u_m: float, fit: Fitted, chosen: Selection, used: Selection
+) -> dict[str, Any]:
+    """Fields that spheres and cylinders have alike."""
+    return {
+        "value": float(radius_m), "uncertainty": float(u_m), "unit": "m", "points": len(used),
+        "set_aside": len(chosen) - len(used), "rms_m": fit.rms_m, "dof": fit.dof,
+        "inflation": fit.inflation, "region": chosen.region,
+    }  # fmt: skip
+
+
+def fit_rounds(
+    model: Model, chosen: Selection, start: Array
+) -> tuple[Array, NDArray[np.bool_], Array, Array, Array]:
+    """Least squares in rounds that set outliers aside.
+
+    Parameters
+    ----------
+    model : callable
+        Parameters and points to residuals, derivatives and normals; the last one is a radius.
+    chosen : Selection
+        The points.
+    start : ndarray, (p,)
+        Where to begin.
+
+    Returns
+    -------
+    tuple
+        Parameters, which points were used, and what the model says of these.
+    """
+    used = np.ones(len(chosen), dtype=np.bool_)
+    values = start
+    for _ in range(ROUNDS):
+        values = _gauss_newton(model, chosen.xyz_m[used], values)
+        residual = model(values, chosen.xyz_m)[0]
+        inside = np.abs(residual) <= max(TRIM_SD * robust_sd(residual[used]), 1e-15)
+        if (inside == used).all() or np.count_nonzero(inside) <= len(values):
+            break
+        used = inside
+    return values, used, *model(values, chosen.xyz_m[used])
+
+
+def _gauss_newton(model: Model, xyz_m: Array, values: Array) -> Array:
+    residual, jacobian, _ = model(values, xyz_m)
+    for _ in range(ITERATIONS):
+        step = np.linalg.lstsq(jacobian, -residual, rcond=None)[0]
+        shrink = 1.0
+        while shrink > 1e-4:
+            trial = values + shrink * step
+            new, new_jacobian, _ = model(trial, xyz_m)
+            if trial[-1] > 0.0 and new @ new <= (residual @ residual) * (1.0 + 1e-9):
+                break
+            shrink *= 0.5
+        else:
+            return values
+        values, residual, jacobian = trial, new, new_jacobian
+        if np.abs(shrink * step).max() <= CONVERGED * abs(values[-1]):
+            return values
+    raise StackError("the fit does not settle: the points make no sphere or cylinder")
+
+
+def _sphere(values: Array, xyz_m: Array) -> tuple[Array, Array, Array]:
+    offset = xyz_m - values[:3]
+    distance = np.linalg.norm(offset, axis=1)
+    normal = offset / distance[:, None]
+    return distance - values[3], np.column_stack([-normal, -np.ones(len(xyz_m))]), normal[:, 2]
+
+
+def _cylinder(values: Array, xyz_m: Array) -> tuple[Array, Array, Array]:
+    """Axis through (0, y0, z0) along (1, my, mz); values are y0, z0, my, mz, radius."""
+    normal = _cylinder_normals(values, xyz_m)
+    y0, z0, my, mz, radius = values
+    offset = xyz_m - np.array([0.0, y0, z0])
+    length = np.sqrt(1.0 + my**2 + mz**2)
+    along = offset @ np.array([1.0, my, mz]) / length**2
+    distance = np.einsum("ij,ij->i", offset, normal)
+    jacobian = np.column_stack([
+        -normal[:, 1], -normal[:, 2], -normal[:, 1] * along, -normal[:, 2] * along,
+        -np.ones(len(xyz_m)),
+    ])  # fmt: skip
+    return distance - radius, jacobian, normal[:, 2]
+
+
+def _cylinder_normals(values: Array, xyz_m: Array) -> Array:
+    """Unit vectors from the axis to the points, (n, 3)."""
+    direction = np.array([1.0, values[2], values[3]])
+    direction /= np.linalg.norm(direction)
+    offset = xyz_m - np.array([0.0, values[0], values[1]])
+    radial = offset - (offset @ direction)[:, None] * direction
+    return np.asarray(radial / np.linalg.norm(radial, axis=1, keepdims=True))
+
+
+def _algebraic_sphere(xyz_m: Array) -> Array:
+    """Start: |p|^2 = 2 c.p + d is linear in c and d."""
+    if len(xyz_m) < 5:
+        raise StackError(f"{len(xyz_m)} points; expected at least 5 for a sphere")
+    middle = xyz_m.mean(axis=0)
+    local = xyz_m - middle
+    design = np.column_stack([2.0 * local, np.ones(len(local))])
+    solution, _, rank, _ = np.linalg.lstsq(design, np.sum(local**2, axis=1), rcond=1e-14)
+    squared = float(solution[3] + solution[:3] @ solution[:3])
+    if rank < 4 or squared <= 0.0:
+        raise StackError("the points make no sphere (a plane?); expected some curvature")
+    return np.append(solution[:3] + middle, np.sqrt(squared))
+
+
+def _paraboloid_cylinder(local_m: Array) -> tuple[Array, Array]:
+    """Frame whose x is the flattest direction, and a start in it, from a fitted paraboloid."""
+    if len(local_m) < 7:
+        raise StackError(f"{len(local_m)} points; expected at least 7 for a cylinder")
+    x, y, z = local_m.T
+    size = max(float(np.abs(local_m[:, :2]).max()), 1e-30)
+    x, y = x / size, y / size
+    design = np.column_stack([x * x, x * y, y * y, x, y, np.ones(len(x))])
+    xx, xy, yy, _, _, top = np.linalg.lstsq(design, z, rcond=None)[0]
+    bends, directions = np.linalg.eigh(np.array([[2 * xx, xy], [xy, 2 * yy]]) / size**2)
+    round_one = int(np.argmax(np.abs(bends)))
+    bend = float(bends[round_one])
+    if abs(bend) < 1e-9 / size:
+        raise StackError("the points make no cylinder (a plane?); expected some curvature")
+    flat = directions[:, 1 - round_one]
+    frame = np.array([[flat[0], flat[1], 0.0], [-flat[1], flat[0], 0.0], [0.0, 0.0, 1.0]])
+    return frame, np.array([0.0, top + 1.0 / bend, 0.0, 0.0, abs(1.0 / bend)])

@@ -1,0 +1,1 @@
+"""The rig model (Eqs. 1-4), its calibration file, and lenses of other programs."""

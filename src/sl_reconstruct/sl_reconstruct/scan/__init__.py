@@ -1,0 +1,1 @@
+"""One scan as a flow of steps, without ROS."""

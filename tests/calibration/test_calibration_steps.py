@@ -1,0 +1,161 @@
+"""The paper's two steps, and the data that are refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sl_calibration.data.homography_prefilter import fits_plane
+from sl_calibration.data.observations import HoleView, TargetView
+from sl_calibration.solve.image_centre_search import search_centre
+from sl_calibration.solve.linear import Sensor, cost_px2, linear_step
+from sl_calibration.solve.rig_solution import solve_rig
+from sl_calibration.solve.stages import solve_camera, solve_projector
+from sl_common.errors import CalibrationError
+from sl_reconstruct.model.rig import Device, Division
+from support.calibration_scenes import CAMERA, HEIGHTS_M, PLATE_XY_M, PROJECTOR, RIG, Scene, spoil
+
+WORLD_M = np.concatenate([np.column_stack([PLATE_XY_M, np.full(100, z)]) for z in HEIGHTS_M])
+DEVICES = pytest.mark.parametrize(
+    ("device", "sensor"),
+    [(RIG.camera, CAMERA), (RIG.projector, PROJECTOR)],
+    ids=["camera", "projector"],
+)
+
+
+@DEVICES
+def test_linear_step_is_exact_at_the_true_centre(device: Device, sensor: Sensor) -> None:
+    """Only the rounds in which kappa's depth settles are left: they contract a thousandfold."""
+    found = linear_step(WORLD_M, device.project(WORLD_M), device.centre_px, sensor)
+    assert found.focal_length_px[0] == pytest.approx(device.focal_length_px[0], rel=1e-6)
+    assert isinstance(found.lens, Division)
+    assert isinstance(device.lens, Division)
+    assert found.lens.kappa == pytest.approx(device.lens.kappa, rel=1e-4)
+    np.testing.assert_allclose(found.rotation, device.rotation, atol=1e-9)
+    np.testing.assert_allclose(found.translation_m, device.translation_m, atol=1e-7)
+    assert found.image_size == device.image_size
+
+
+def test_linear_step_needs_no_lateral_offset() -> None:
+    """Tsai divides by t_y, which is zero for a device that looks at the origin."""
+    turned = RIG.camera.rotation
+    device = Device((1600, 1200), (17e3, 17e3), (800, 600), 1e-5, turned, np.array([0, 0, 0.14]),
+                    Division(1e-8))  # fmt: skip
+    found = linear_step(WORLD_M, device.project(WORLD_M), device.centre_px, CAMERA)
+    np.testing.assert_allclose(found.translation_m, [0, 0, 0.14], atol=1e-7)
+
+
+@DEVICES
+def test_search_finds_the_centre_wherever_it_is(device: Device, sensor: Sensor) -> None:
+    """The projector's is 483 px off the DMD's middle. The simplex ends at 0.5 px."""
+    found = search_centre(WORLD_M, device.project(WORLD_M), sensor)
+    np.testing.assert_allclose(found.device.centre_px, device.centre_px, atol=1.0)
+    assert found.points == len(WORLD_M)
+
+
+@DEVICES
+def test_search_brings_the_cost_to_the_noise(device: Device, sensor: Sensor) -> None:
+    """J of N points is 2 N sigma^2 (chi-square: +- 4 / sqrt(N) of it), less a few parameters."""
+    noise_px = 0.02
+    pixels = device.project(WORLD_M)
+    pixels += noise_px * np.random.default_rng(3).standard_normal(pixels.shape)
+    found = search_centre(WORLD_M, pixels, sensor)
+    expected = 2 * len(WORLD_M) * noise_px**2
+    assert found.cost_after_px2 == pytest.approx(expected, rel=4 / np.sqrt(len(WORLD_M)))
+    assert found.cost_before_px2 > 100 * found.cost_after_px2
+    assert found.cost_after_px2 == pytest.approx(cost_px2(found.device, WORLD_M, pixels))
+
+
+def test_screen_finds_gross_errors_and_spares_the_lens() -> None:
+    rng = np.random.default_rng(4)
+    view = np.repeat(np.arange(5), 100)
+    pixels = RIG.camera.project(WORLD_M)
+    assert fits_plane(WORLD_M[:, :2], pixels, view).all()
+    bad = spoil(pixels, 0.05, 20.0, rng)
+    np.testing.assert_array_equal(fits_plane(WORLD_M[:, :2], pixels, view), ~bad)
+
+
+def views(heights_m: list[float], holes: int = 100, noise_px: float = 0.01) -> list[HoleView]:
+    made = Scene(hole_noise_px=noise_px).views(5, np.array([[0, 0, z] for z in heights_m]))[0]
+    return [HoleView(v.stage_m, v.plate_xy_m[:holes], v.pixels[:holes], v.sigma_px[0, 0])
+            for v in made]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("seen", "message"),
+    [
+        ([], "expected at least 12 in each of 2 views"),
+        (views([0.0]), "one height only .*expected at least 2 heights"),
+        (views([1e-3, 1e-3, 1e-3]), "one height only"),
+        (views([-1e-3, 1e-3], holes=9), r"\[9, 9\] holes in 2 views; expected at least 12"),
+        (
+            views([0.0, 5e-6], noise_px=0.05),
+            r"z travel would be known to .* from heights over 0.005 mm; expected .* or more",
+        ),
+    ],
+    ids=["none", "one height", "one height thrice", "few holes", "heights too close"],
+)
+def test_degenerate_views_are_refused(seen: list[HoleView], message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        solve_camera(seen, CAMERA)
+
+
+def test_holes_in_one_line_are_refused() -> None:
+    line = [
+        HoleView(v.stage_m, v.plate_xy_m[40:60:1][:20] * [1, 0], v.pixels[40:60], 0.01)
+        for v in views([-1e-3, 0.0, 1e-3])
+    ]
+    with pytest.raises(CalibrationError):
+        solve_camera(line, CAMERA)
+
+
+def test_a_plate_turned_over_is_refused() -> None:
+    """From behind, x is mirrored: only a camera below the plate could see that."""
+    mirrored = [
+        HoleView(v.stage_m, v.plate_xy_m * [-1, 1], v.pixels, 0.01)
+        for v in views([-1e-3, 0.0, 1e-3])
+    ]
+    with pytest.raises(CalibrationError, match=r"turned over|signs right"):
+        solve_camera(mirrored, CAMERA)
+
+
+def test_heights_of_the_wrong_sign_are_refused() -> None:
+    flipped = [
+        HoleView(-v.stage_m, v.plate_xy_m, v.pixels, 0.01) for v in views([-1e-3, 0.0, 1e-3])
+    ]
+    with pytest.raises(CalibrationError):
+        solve_camera(flipped, CAMERA)
+
+
+def test_a_projector_seen_at_one_height_is_refused() -> None:
+    _, targets = Scene().views(6, np.zeros((1, 3)))
+    with pytest.raises(CalibrationError, match="projected targets at one height only"):
+        solve_projector(targets, RIG.camera, np.eye(3), PROJECTOR)
+
+
+def test_a_rig_without_targets_is_refused() -> None:
+    holes, _ = Scene().views(6)
+    with pytest.raises(CalibrationError, match="projected targets"):
+        solve_rig(holes, [], CAMERA, PROJECTOR)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"stage_m": [0.0, 0.0]}, r"stage_m.shape=\(2,\); expected \(3,\)"),
+        ({"pixels": np.zeros((4, 2))}, r"pixels.shape=\(4, 2\); expected \(5, 2\)"),
+        ({"pixels": np.full((5, 2), np.nan)}, "not finite"),
+        ({"sigma_px": 0.0}, "not positive"),
+        ({"sigma_px": np.ones(4)}, "sigma_px.shape"),
+    ],
+)
+def test_broken_observations_are_refused(change: dict[str, object], message: str) -> None:
+    fields = {"stage_m": np.zeros(3), "plate_xy_m": np.zeros((5, 2)), "pixels": np.zeros((5, 2)),
+              "sigma_px": 0.01}  # fmt: skip
+    with pytest.raises(CalibrationError, match=message):
+        HoleView(**{**fields, **change})  # type: ignore[arg-type]
+
+
+def test_targets_have_a_sigma_for_each_coordinate() -> None:
+    view = TargetView(np.zeros(3), np.zeros((3, 2)), np.zeros((3, 2)), np.array([[1, 2]] * 3))
+    np.testing.assert_array_equal(view.sigma_px, [[1, 2]] * 3)

@@ -1,0 +1,134 @@
+"""A private ROS graph for tests: own domain, loopback discovery, one executor in a thread.
+
+Import nothing of ROS before `require_ros` has set the environment.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from support.domains import ReservedDomain
+
+#: Discovery takes up to 2.2 s on a busy machine; whoever waits for it waits longer.
+PATIENCE_S = 15.0
+
+
+def require_ros() -> None:
+    """Skip the module where ROS or the project's messages are not installed."""
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    with warnings.catch_warnings():
+        # ROS' own generator imports a deprecated module of the standard library.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        pytest.importorskip("rclpy", reason="ROS (rclpy) is not installed")
+        pytest.importorskip("rosidl_generator_py", reason="ROS is not complete")
+    pytest.importorskip("sl_interfaces.msg", reason="sl_interfaces is not installed")
+
+
+def wait(predicate: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
+    """Wait until the predicate gives something true, and return it."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        if found := predicate():
+            return found
+        time.sleep(0.005)
+    pytest.fail(f"waited {timeout_s:g} s for {what}")
+
+
+class Graph:
+    """Nodes in one executor, and a node of the test's own."""
+
+    def __init__(self) -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        self.context = rclpy.Context()
+        self._reserved = ReservedDomain()
+        self.domain = self._reserved.number
+        rclpy.init(context=self.context, domain_id=self.domain)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.tester = rclpy.create_node("tester", namespace="sl", context=self.context)
+        self.executor.add_node(self.tester)
+        self._nodes: list[Any] = []
+        self._thread = threading.Thread(target=self._spin)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        from rclpy.executors import ExternalShutdownException
+
+        try:
+            self.executor.spin()
+        except ExternalShutdownException:
+            return
+
+    def add(self, make: Callable[..., Any], *args: Any, **parameters: Any) -> Any:
+        """Make a node with these parameters."""
+        from rclpy.parameter import Parameter
+
+        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        node = make(*args, context=self.context, parameter_overrides=overrides)
+        self._nodes.append(node)
+        self.executor.add_node(node)
+        return node
+
+    def remove(self, node: Any) -> None:
+        """End a node as `base_node.run` does."""
+        self._nodes.remove(node)
+        self.executor.remove_node(node)
+        node.close()
+        node.destroy_node()
+
+    def publisher(self, kind: Any, topic: str, qos: Any) -> Any:
+        """Make a publisher that has found its subscriber."""
+        publisher = self.tester.create_publisher(kind, topic, qos)
+        wait(publisher.get_subscription_count, f"a subscriber of {topic}")
+        return publisher
+
+    def collect(self, kind: Any, topic: str, qos: Any) -> list[Any]:
+        """Messages of a topic as they come; its publisher has been found."""
+        found: list[Any] = []
+        subscription = self.tester.create_subscription(kind, topic, found.append, qos)
+        wait(lambda: self.tester.count_publishers(topic), f"a publisher of {topic}")
+        wait(lambda: subscription.get_publisher_count(), f"a publisher of {topic}")
+        return found
+
+    def call(self, kind: Any, service: str, request: Any, timeout_s: float = PATIENCE_S) -> Any:
+        """Call a service and wait for its answer."""
+        future = self.call_async(kind, service, request)
+        wait(future.done, f"an answer of {service}", timeout_s)
+        return future.result()
+
+    def call_async(self, kind: Any, service: str, request: Any) -> Any:
+        """Call a service."""
+        client = self.tester.create_client(kind, service)
+        assert client.wait_for_service(PATIENCE_S), f"nobody offers {service}"
+        return client.call_async(request)
+
+    def close(self) -> None:
+        """End everything, in the order of a clean shutdown: no callback runs any more."""
+        self.executor.shutdown()
+        self._thread.join(timeout=10)
+        for node in self._nodes:
+            node.close()
+            node.destroy_node()
+        self._nodes.clear()
+        self.tester.destroy_node()
+        self.context.try_shutdown()
+        self._reserved.release()
+
+
+@contextmanager
+def graph() -> Iterator[Graph]:
+    """A graph that is closed whatever happens."""
+    made = Graph()
+    try:
+        yield made
+    finally:
+        made.close()
