@@ -210,11 +210,7 @@ def test_region_and_gain(wiring: Wiring) -> None:
 
 
 @pytest.mark.parametrize(
-    "settings",
-    [
-        CameraSettings(pixel_format="mono16"),
-        CameraSettings(region=(0, 0, WIDTH + 1, 1)),
-    ],
+    "settings", [CameraSettings(pixel_format="mono16"), CameraSettings(region=(0, 0, WIDTH + 1, 1))]
 )
 def test_refused_settings_leave_the_camera_as_it_was(
     wiring: Wiring, settings: CameraSettings

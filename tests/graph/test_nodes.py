@@ -25,13 +25,7 @@ from rclpy.action import ActionClient  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
 from sl_interfaces.action import Scan as ScanAction  # noqa: E402
-from sl_interfaces.msg import (  # noqa: E402
-    MatchedFrame,
-    PatternStack,
-    PatternTrigger,
-    RigCalibration,
-    ScanReport,
-)
+from sl_interfaces.msg import MatchedFrame, PatternStack, PatternTrigger, RigCalibration, ScanReport  # noqa: E402
 from sl_interfaces.msg import Pattern as PatternMsg  # noqa: E402
 from sl_interfaces.srv import Measure, MoveStage, Project, Scan  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
@@ -51,11 +45,7 @@ from sl_projector.sequence.messages import stamp_from_msg, stamp_to_msg, trigger
 from sl_reconstruct.cloud.cloud_writer import cloud_hash  # noqa: E402
 from sl_reconstruct.cloud.refusals import REFUSALS, Reason  # noqa: E402
 from sl_reconstruct.messages import cloud_from_msg, refusals_from_msg  # noqa: E402
-from sl_reconstruct.model.calibration_file import (  # noqa: E402
-    dump_calibration,
-    rig_hash,
-    save_calibration,
-)
+from sl_reconstruct.model.calibration_file import dump_calibration, rig_hash, save_calibration  # noqa: E402
 from sl_reconstruct.reconstruct_node import ReconstructNode  # noqa: E402
 from support.fake_devices import FakeCamera, FakeProjector, FakeStage, WiredPair  # noqa: E402
 from support.ros_graph import Graph, wait  # noqa: E402

@@ -11,13 +11,7 @@ import numpy as np
 from sl_camera.camera.camera import CameraSettings, CameraStatistics, Frame, FrameStatus
 from sl_camera.stage.stage import Position, StageLimits, StageState
 from sl_common.errors import DeviceError, DeviceLost, DeviceRefused
-from sl_projector.dlpc.dmd import (
-    DmdModel,
-    LoadInfo,
-    ProjectorStatus,
-    RunInfo,
-    Timing,
-)
+from sl_projector.dlpc.dmd import DmdModel, LoadInfo, ProjectorStatus, RunInfo, Timing
 from sl_projector.sequence.pattern_sequence import PatternSequence
 
 #: A DLP5500 of 128 x 96 mirrors, the size of `tiny_scans`.

@@ -57,11 +57,7 @@ class EmulatedUsb:
         Vendor, product and serial number.
     """
 
-    def __init__(
-        self,
-        device: HidDevice,
-        identity: UsbIdentity = DLPC900_IDENTITY,
-    ) -> None:
+    def __init__(self, device: HidDevice, identity: UsbIdentity = DLPC900_IDENTITY) -> None:
         self.device = device
         self.identity = identity
         self.present = True

@@ -90,12 +90,7 @@ class BagWriter:
         self._writer.write(self._connections[topic], stamp_ns, data)
 
     def trigger(
-        self,
-        sequence: PatternSequence,
-        index: int,
-        scan_id: int,
-        stamp_ns: int,
-        exposure_s: float,
+        self, sequence: PatternSequence, index: int, scan_id: int, stamp_ns: int, exposure_s: float
     ) -> None:
         """Write that pattern ``index`` began to be exposed at ``stamp_ns``."""
         pattern = sequence.patterns[index]

@@ -169,8 +169,7 @@ def _scans_in(path: Path, namespace: str | None) -> int:
 
 
 def _tell(
-    args: argparse.Namespace,
-    results: Sequence[tuple[Variant, list[tuple[Task, Result | SlError]]]],
+    args: argparse.Namespace, results: Sequence[tuple[Variant, list[tuple[Task, Result | SlError]]]]
 ) -> Iterator[str]:
     """Say what came of it; yield what is wrong."""
     for variant, outcomes in results:

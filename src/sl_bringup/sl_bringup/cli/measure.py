@@ -18,11 +18,7 @@ from sl_common.errors import ConfigError, StackError
 from sl_reconstruct.cloud.cloud_reader import read_cloud, read_height_map
 from sl_reconstruct.cloud.height_map import make_height_map
 from sl_reconstruct.cloud.x3p_writer import save_x3p
-from sl_reconstruct.measure.deviation import (
-    DeviationMeasurement,
-    map_reference,
-    measure_deviation,
-)
+from sl_reconstruct.measure.deviation import DeviationMeasurement, map_reference, measure_deviation
 from sl_reconstruct.measure.features import FEATURES, RECTANGLE, Numbers, Points
 from sl_reconstruct.measure.plane_angle import PlaneMeasurement
 from sl_reconstruct.measure.profile import ProfileMeasurement, save_profile

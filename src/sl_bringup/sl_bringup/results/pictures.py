@@ -205,12 +205,7 @@ def _filled_from_nearest(z: NDArray[Any], there: NDArray[np.bool_]) -> NDArray[A
 
 
 def _map(
-    height: HeightMap,
-    values_m: NDArray[Any],
-    title: str,
-    label: str,
-    colours: str,
-    symmetric: bool,
+    height: HeightMap, values_m: NDArray[Any], title: str, label: str, colours: str, symmetric: bool
 ) -> bytes:
     """Draw values on the grid of a height map with a colour bar in a fitting unit."""
     finite = values_m[np.isfinite(values_m)].astype(np.float64)

@@ -100,10 +100,7 @@ class Volume(NamedTuple):
 
 
 def sigma_map(
-    bundle: Bundle,
-    volume: Volume,
-    noise: EdgeNoise,
-    shape: tuple[int, int, int] = (13, 10, 3),
+    bundle: Bundle, volume: Volume, noise: EdgeNoise, shape: tuple[int, int, int] = (13, 10, 3)
 ) -> tuple[Array, Array]:
     """Points (nz, ny, nx, 3) that span a volume, and their predicted 1-sigma, same shape, metres.
 

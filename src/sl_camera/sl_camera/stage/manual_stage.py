@@ -22,9 +22,7 @@ class ManualStage:
     """
 
     def __init__(
-        self,
-        low_m: Position = (-0.025, -0.025, -0.01),
-        high_m: Position = (0.025, 0.025, 0.01),
+        self, low_m: Position = (-0.025, -0.025, -0.01), high_m: Position = (0.025, 0.025, 0.01)
     ) -> None:
         self._limits = StageLimits(low_m, high_m)
         self._cv = threading.Condition()

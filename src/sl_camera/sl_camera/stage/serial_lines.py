@@ -33,11 +33,7 @@ class SerialLines:
     """
 
     def __init__(
-        self,
-        port: str,
-        baud: int,
-        on_line: Callable[[str], None],
-        on_lost: Callable[[str], None],
+        self, port: str, baud: int, on_line: Callable[[str], None], on_lost: Callable[[str], None]
     ) -> None:
         self.port = port
         self._on_line, self._on_lost = on_line, on_lost

@@ -13,13 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sl_common.clock import Clock
-from sl_common.errors import (
-    ConfigError,
-    DeviceError,
-    DeviceRefused,
-    DeviceTimeout,
-    SequenceError,
-)
+from sl_common.errors import ConfigError, DeviceError, DeviceRefused, DeviceTimeout, SequenceError
 from sl_projector.dlpc import dlpc350_protocol as protocol
 from sl_projector.dlpc import dlpc900_protocol as common
 from sl_projector.dlpc.dlpc350_flash import Layout, flash_layout

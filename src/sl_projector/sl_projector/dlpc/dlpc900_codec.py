@@ -205,10 +205,7 @@ def encode_image(words: Words) -> bytes:
     words : ndarray of uint32, shape (rows, columns)
         Bit k of a word is plane k of the image.
     """
-    encoded = [
-        (ENHANCED_RLE, encode_enhanced_rle(words)),
-        (RLE, encode_rle(words)),
-    ]
+    encoded = [(ENHANCED_RLE, encode_enhanced_rle(words)), (RLE, encode_rle(words))]
     rows, columns = words.shape
     if min(len(data) for _, data in encoded) > 3 * columns * rows:
         encoded.append((UNCOMPRESSED, encode_uncompressed(words)))

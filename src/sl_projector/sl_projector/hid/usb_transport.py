@@ -14,12 +14,7 @@ from typing import Any, NoReturn, Protocol
 import usb.core
 import usb.util
 
-from sl_common.errors import (
-    ConfigError,
-    DeviceError,
-    DeviceLost,
-    DeviceTimeout,
-)
+from sl_common.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
 from sl_projector.hid.usb_socket import ENDPOINT_IN, ENDPOINT_OUT, LinkBackend, SocketLink
 
 REPORT_BYTES = 64

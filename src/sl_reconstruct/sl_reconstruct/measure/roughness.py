@@ -14,14 +14,7 @@ from numpy.typing import NDArray
 
 from sl_common.errors import ConfigError, StackError
 from sl_reconstruct.cloud.height_map import HeightMap, make_height_map
-from sl_reconstruct.measure.denoise import (
-    Corrected,
-    Waves,
-    extremes,
-    fill,
-    noise_part,
-    take_off,
-)
+from sl_reconstruct.measure.denoise import Corrected, Waves, extremes, fill, noise_part, take_off
 from sl_reconstruct.measure.region import Region
 from sl_reconstruct.measure.result import Measurement, Quantity
 

@@ -22,13 +22,7 @@ from sl_camera.stage.zaber.zaber_protocol import (
     command,
     parse_reply,
 )
-from sl_common.errors import (
-    ConfigError,
-    DeviceError,
-    DeviceLost,
-    DeviceRefused,
-    DeviceTimeout,
-)
+from sl_common.errors import ConfigError, DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
 
 POLL_S = 0.05
 NO_REFERENCE = "position counts from where it was switched on"
