@@ -11,9 +11,7 @@ import pytest
 
 from sl_bringup.graph.transport import Transport
 from support.domains import ReservedDomain
-
-ROOT = Path(__file__).resolve().parents[1]
-
+from support.paths import DATA
 
 #: Kinds of devices that have contract tests.
 HARDWARE = ("dlpc900", "camera", "grbl", "zaber")
@@ -66,7 +64,7 @@ def ros_domain() -> int:
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """Foreign data beside the repository; tests that need it are skipped without."""
-    directory = ROOT.parent / "shared" / "data"
+    directory = DATA
     if not directory.is_dir():
         pytest.skip("no foreign data: ../shared/data is not beside the repository")
     return directory

@@ -39,8 +39,8 @@ from sl_projector.dlpc.dlpc900_driver import Dlpc900
 from sl_projector.dlpc.dmd import Timing
 from sl_projector.sequence.pattern_sequence import named
 from sl_reconstruct.model.calibration_file import load_calibration, rig_hash
+from support.paths import ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
 CONFIG = """
 /sl/bench:
   ros__parameters:

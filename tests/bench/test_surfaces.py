@@ -1,7 +1,5 @@
 """Surfaces and their distances against closed forms, brute force and a foreign file."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -9,8 +7,9 @@ import pytest
 from sl_bench.world.reference_rig import reference_rig
 from sl_bench.world.surfaces import height_map, make_surface
 from sl_common.errors import ConfigError
+from support.paths import DATA
 
-TMD = Path(__file__).parents[2] / "shared/data/surfaces/coin_us_dime.tmd"
+TMD = DATA / "surfaces" / "coin_us_dime.tmd"
 
 
 def test_flat_distance_is_height():

@@ -34,8 +34,9 @@ from sl_bringup.bag.bags import (
 from sl_common.errors import BagError
 from sl_projector.sequence.pattern_sequence import named
 from sl_reconstruct.model.calibration_file import Calibration, parse_calibration, rig_hash
+from support.paths import DATA
 
-ROSBAG2 = Path(__file__).parents[2] / "shared" / "data" / "rosbag2"
+ROSBAG2 = DATA / "rosbag2"
 needs_rosbag2 = pytest.mark.skipif(not ROSBAG2.is_dir(), reason=f"no data in {ROSBAG2}")
 
 START_NS = 1_700_000_000_000_000_000

@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from sl_bringup.cli.main import doctor, main
+from sl_bringup.cli import doctor
+from sl_bringup.cli.main import main
+from sl_bringup.graph import doctor_checks, doctor_devices
 from sl_bringup.graph.doctor_checks import Finding
-from sl_bringup.graph.graph import GraphOptions, doctor_checks, doctor_devices
+from sl_bringup.graph.graph import GraphOptions
 from sl_bringup.graph.graph_config import Changes, write_config
 from sl_bringup.graph.transport import MIB
 

@@ -20,6 +20,7 @@ from sl_common.errors import ConfigError
 from sl_projector.sequence.pattern_sequence import PatternSequence
 from sl_reconstruct.model.calibration_file import Calibration, rig_hash, save_calibration
 from sl_reconstruct.model.rig import Rig
+from support.paths import DATA, EXAMPLES
 from support.tiny_scans import (
     DMD_SIZE,
     HEIGHT_M,
@@ -30,8 +31,8 @@ from support.tiny_scans import (
     write_images,
 )
 
-BOARD = Path(__file__).parents[2] / "shared" / "data" / "procam_board"
-EXAMPLE = Path(__file__).parents[1] / "examples" / "procam_board.yaml"
+BOARD = DATA / "procam_board"
+EXAMPLE = EXAMPLES / "procam_board.yaml"
 needs_board = pytest.mark.skipif(not BOARD.is_dir(), reason=f"no data in {BOARD}")
 
 START_NS = 1_700_000_000_000_000_000

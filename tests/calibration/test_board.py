@@ -17,9 +17,10 @@ from sl_projector.sequence.pattern_sequence import AXES, Pattern, PatternSequenc
 from sl_projector.sequence.sequence_file import load_sequence
 from sl_reconstruct.model.calibration_file import load_rig
 from sl_reconstruct.model.rig import BrownConrady, Device
+from support.paths import DATA, EXAMPLES
 
-PROCAM = Path(__file__).parents[2] / "shared" / "data" / "procam_board"
-EXAMPLE = Path(__file__).parents[1] / "examples" / "procam_board.yaml"
+PROCAM = DATA / "procam_board"
+EXAMPLE = EXAMPLES / "procam_board.yaml"
 
 BOARD = Board(7, 5, 0.02)
 NO_LENS = BrownConrady((0.0, 0.0, 0.0, 0.0, 0.0))

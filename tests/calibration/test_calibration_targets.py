@@ -15,8 +15,8 @@ from sl_bench.world.mounting import Mounting
 from sl_bringup.bag.bag_writer import new_bag
 from sl_bringup.bag.bags import CALIBRATION_RUN, message_class
 from sl_bringup.cli.main import main
+from sl_bringup.evaluation import calibrate_bag
 from sl_bringup.evaluation.calibrate_bag import solve_recorded
-from sl_bringup.evaluation.evaluation import calibrate_bag
 from sl_calibration.data.run_store import CAMERA
 from sl_calibration.report.camera_file import load_kept
 from sl_calibration.solve.bundle_adjustment import lens_values

@@ -1,7 +1,6 @@
 """Hole plates: every centre against the truth of the bench, of drawn images and of foreign data."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,6 +15,7 @@ from sl_calibration.target.plate import DEFAULT_PLATE, HoleFlag, Plate
 from sl_calibration.target.plate_map import map_circles
 from sl_common.errors import CalibrationError
 from support.bench_scenes import tilt
+from support.paths import DATA
 from support.plate_scenes import PLATE, chamfered, drawn, exposed, pinhole, through
 
 #: What the issue asks of a centre on the reference bench.
@@ -25,7 +25,7 @@ LIMIT_PX = 0.02
 #: much again for the raster of the drawing.
 DRAWN_PX = 10 * 0.0095 * np.sqrt(2 / 40)
 WHITE = [(np.full((768, 1024), 255, dtype=np.uint8), 1 / 30)]
-FOREIGN = Path(__file__).resolve().parents[2] / "shared/data/circle_plate"
+FOREIGN = DATA / "circle_plate"
 
 
 def lit(world, frame=0):

@@ -18,9 +18,10 @@ from sl_bringup.cli.main import main
 from sl_reconstruct.cloud.plane_fit import fit_plane
 from sl_reconstruct.model.calibration_file import load_rig
 from sl_reconstruct.model.rig import Rig
+from support.paths import DATA, EXAMPLES
 
-BOARD = Path(__file__).parents[2] / "shared" / "data" / "procam_board"
-EXAMPLE = Path(__file__).parents[1] / "examples" / "procam_board.yaml"
+BOARD = DATA / "procam_board"
+EXAMPLE = EXAMPLES / "procam_board.yaml"
 CORNERS = (9, 7)
 ROW_MM = 8 * 75.0
 #: Half a square of the board in the image (75 mm at 3.4 m with f = 3442 px are 76 px).

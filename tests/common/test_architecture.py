@@ -16,7 +16,8 @@ from typing import Any
 import pytest
 import setuptools
 
-ROOT = Path(__file__).resolve().parents[2]
+from support.paths import ROOT
+
 PACKAGES = tuple(sorted(m.parent.name for m in (ROOT / "src").glob("*/package.xml")))
 PYTHON_PACKAGES = tuple(name for name in PACKAGES if name != "sl_interfaces")
 #: What each package may import of ours: packages, or rooms of them (``package.room``).

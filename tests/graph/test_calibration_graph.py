@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from support import ros_graph
+from support.paths import SOURCES
 
 ros_graph.require_ros()
 
@@ -30,7 +31,6 @@ from sl_common.base_node import LATCHED  # noqa: E402
 from sl_reconstruct.model.calibration_file import load_rig, parse_calibration, rig_hash  # noqa: E402
 from support.ros_graph import Graph, wait  # noqa: E402
 
-SOURCES = Path(__file__).parent.parent / "src"
 NODES = {
     "projector": ("sl_projector.projector_node", "device:=socket:{}/usb.sock"),
     "camera": ("sl_camera.camera_node", "address:={}/camera.sock"),

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from support import ros_graph
+from support.paths import SOURCES
 
 ros_graph.require_ros()
 
@@ -30,7 +31,6 @@ from support.ros_graph import Graph, wait  # noqa: E402
 
 #: Where the stage puts the plate; a whole number of the emulated stage's steps.
 HEIGHT_M = 0.2e-3
-SOURCES = Path(__file__).parent.parent / "src"
 NODES = {
     "projector": ("sl_projector.projector_node", "device:=socket:{}/usb.sock"),
     "camera": ("sl_camera.camera_node", "address:={}/camera.sock"),

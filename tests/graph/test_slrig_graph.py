@@ -18,9 +18,10 @@ from plyfile import PlyData
 from sl_bringup.graph.graph_config import NODES
 from sl_bringup.graph.transport import process_environment
 from support.domains import ReservedDomain
+from support.paths import ROOT
 from support.processes import wait_until_ended
 
-SOAK = Path(__file__).parent.parent / "benchmarks" / "soak_faults.py"
+SOAK = ROOT / "benchmarks" / "soak_faults.py"
 SLRIG = (sys.executable, "-m", "sl_bringup.cli.main")
 #: The first start on a machine compiles for a minute or two.
 READY_PATIENCE_S = 280.0

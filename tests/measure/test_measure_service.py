@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 from support import ros_graph
+from support.paths import ROOT
 
 ros_graph.require_ros()
 
@@ -144,7 +145,7 @@ def test_without_a_cloud_it_says_what_it_waits_for(empty) -> None:
 
 def stock_calls() -> list[tuple[str, str]]:
     """Type and request of every call by the stock tools that the manual shows."""
-    root = Path(__file__).parents[1]
+    root = ROOT
     text = "".join(file.read_text() for file in [root / "README.md", *root.glob("docs/*.md")])
     return re.findall(
         r'^ros2 (?:service|action) .* (sl_interfaces/\S+) "(.*)"$', text, re.MULTILINE

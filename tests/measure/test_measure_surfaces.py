@@ -1,7 +1,5 @@
 """Roughness, exchange formats and foreign libraries: analytic surfaces and a measured coin."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -13,10 +11,11 @@ from sl_reconstruct.measure.region import Region, Selection, select
 from sl_reconstruct.measure.roughness import areal_parameters, measure_roughness
 from sl_reconstruct.measure.sphere_cylinder import measure_sphere
 from support.measured_clouds import cloud
+from support.paths import DATA
 
 surfalize = pytest.importorskip("surfalize", reason="pip install surfalize")
 
-COIN = Path(__file__).resolve().parents[2] / "shared/data/surfaces/coin_us_dime.tmd"
+COIN = DATA / "surfaces" / "coin_us_dime.tmd"
 STEP_M, WAVE_M, AMPLITUDE_M = 1e-6, 100e-6, 0.8e-6
 
 

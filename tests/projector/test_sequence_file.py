@@ -16,8 +16,7 @@ from sl_projector.sequence.sequence_file import (
     parse_sequence,
     save_sequence,
 )
-
-EXAMPLES = Path(__file__).parents[1] / "examples"
+from support.paths import EXAMPLES
 
 
 def read(text: str) -> PatternSequence:

@@ -24,8 +24,9 @@ from sl_reconstruct.model.calibration_file import (
     save_calibration,
 )
 from sl_reconstruct.model.rig import BrownConrady, Device, Rig
+from support.paths import DATA
 
-BOARD = Path(__file__).parents[2] / "shared" / "data" / "procam_board"
+BOARD = DATA / "procam_board"
 needs_board = pytest.mark.skipif(not BOARD.is_dir(), reason=f"no data in {BOARD}")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from functools import cache
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,12 +14,13 @@ from sl_reconstruct.cloud.cloud import Cloud
 from sl_reconstruct.model.rig import BrownConrady, Device, Rig
 from sl_reconstruct.reconstruction.reconstructor import Reconstructor
 from sl_reconstruct.reconstruction.scan_quality import verdict
+from support.paths import DATA
 
-DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "procam_board"
+BOARD = DATA / "procam_board"
 CAPTURES = (0, 1, 2)
 PITCH_M = 0.075
 
-pytestmark = pytest.mark.skipif(not DATA.exists(), reason="shared/data/procam_board is absent")
+pytestmark = pytest.mark.skipif(not BOARD.exists(), reason="shared/data/procam_board is absent")
 
 
 def sequence() -> PatternSequence:
@@ -42,13 +42,13 @@ def device(size: tuple[int, int], K: np.ndarray, lens: np.ndarray, R: np.ndarray
 
 
 def right_rig() -> Rig:
-    c = json.loads((DATA / "calibration.json").read_text())
+    c = json.loads((BOARD / "calibration.json").read_text())
     camera = device((1280, 1024), c["cam_K"], c["cam_dist"], np.eye(3), np.zeros(3))
     return Rig(camera, device((1024, 768), c["proj_K"], c["proj_dist"], c["R"], c["T"]))
 
 
 def wrong_rig() -> Rig:
-    file = cv2.FileStorage(str(DATA / "wrong_calibration.xml"), cv2.FILE_STORAGE_READ)
+    file = cv2.FileStorage(str(BOARD / "wrong_calibration.xml"), cv2.FILE_STORAGE_READ)
 
     def m(name: str) -> np.ndarray:
         return file.getNode(name).mat()
@@ -60,7 +60,7 @@ def wrong_rig() -> Rig:
 
 @cache
 def stack(capture: int) -> np.ndarray:
-    folder = DATA / f"capture_{capture}"
+    folder = BOARD / f"capture_{capture}"
     files = [folder / f"graycode_{i:02d}.png" for i in range(42)]
     return np.stack([cv2.imread(str(f), cv2.IMREAD_GRAYSCALE) for f in files])
 

@@ -57,16 +57,14 @@ class Graph:
         self.tester = rclpy.create_node("tester", namespace="sl", context=self.context)
         self.executor.add_node(self.tester)
         self._nodes: list[Any] = []
+        self._ended = threading.Event()
         self._thread = threading.Thread(target=self._spin)
         self._thread.start()
 
     def _spin(self) -> None:
-        from rclpy.executors import ExternalShutdownException
-
-        try:
-            self.executor.spin()
-        except ExternalShutdownException:
-            return
+        # Not `spin` and a shutdown from another thread: rclpy then waits on what is gone.
+        while not self._ended.is_set():
+            self.executor.spin_once()
 
     def add(self, make: Callable[..., Any], *args: Any, **parameters: Any) -> Any:
         """Make a node with these parameters."""
@@ -113,8 +111,10 @@ class Graph:
 
     def close(self) -> None:
         """End everything, in the order of a clean shutdown: no callback runs any more."""
+        self._ended.set()
+        self.executor.create_task(lambda: None)  # wakes it
+        self._thread.join(timeout=PATIENCE_S)
         self.executor.shutdown()
-        self._thread.join(timeout=10)
         for node in self._nodes:
             node.close()
             node.destroy_node()

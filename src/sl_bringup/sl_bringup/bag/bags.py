@@ -86,7 +86,7 @@ def interface_dir() -> Path:
     """
     prefixes = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
     places = [
-        Path(__file__).resolve().parents[2] / "sl_interfaces" / "msg",
+        Path(__file__).resolve().parents[3] / "sl_interfaces" / "msg",
         *(Path(p) / "share" / "sl_interfaces" / "msg" for p in [*prefixes, sys.prefix]),
     ]
     for place in places:

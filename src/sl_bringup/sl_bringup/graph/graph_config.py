@@ -73,7 +73,7 @@ def find_config(name: str) -> Path:
     ConfigError
         When it was not installed.
     """
-    places = [Path(__file__).resolve().parents[1] / "config"]
+    places = [Path(__file__).resolve().parents[2] / "config"]
     prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(":"), sys.prefix]
     places += [Path(prefix) / "share" / "sl_bringup" / "config" for prefix in prefixes if prefix]
     for place in places:
