@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Literal, Protocol
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ TriggerMode = Literal["hardware", "software", "free"]
 PixelFormat = Literal["mono8", "mono10", "mono10p", "mono12", "mono12p", "mono16"]
 Encoding = Literal["mono8", "mono16"]
 
-TRIGGER_MODES: tuple[TriggerMode, ...] = ("hardware", "software", "free")
+TRIGGER_MODES: tuple[TriggerMode, ...] = get_args(TriggerMode)
 #: Significant bits of each pixel format; "p" is packed on the way, for slow cables.
 PIXEL_BITS: dict[PixelFormat, int] = {
     "mono8": 8, "mono10": 10, "mono10p": 10, "mono12": 12, "mono12p": 12, "mono16": 16,

@@ -45,7 +45,15 @@ class DeviceClock:
             self._latched_at_ns, self._uncertainty_ns = after_ns, uncertainty_ns
 
     def arrival(self, device_ns: int, host_ns: int, exposure_s: float) -> None:
-        """Take a frame: it arrived at `host_ns`, at least its exposure after its stamp."""
+        """Take a frame: it arrived at `host_ns`, at least its exposure after its stamp.
+
+        Parameters
+        ----------
+        device_ns, host_ns : int
+            Start of the exposure by the camera's clock; arrival by the host's, nanoseconds.
+        exposure_s : float
+            Exposure time, seconds.
+        """
         self._delays_ns.append(host_ns - device_ns - round(exposure_s * 1e9))
 
     def host_ns(self, device_ns: int) -> int:

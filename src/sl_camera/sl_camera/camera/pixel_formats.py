@@ -44,7 +44,13 @@ class WireFormat:
     packing: str = "none"
 
     def size(self, width: int, height: int) -> int:
-        """Bytes of an image; packed pixels run on from row to row."""
+        """Bytes of an image; packed pixels run on from row to row.
+
+        Parameters
+        ----------
+        width, height : int
+            Image size, pixels.
+        """
         return (width * height * self.wire_bits + 7) // 8
 
 

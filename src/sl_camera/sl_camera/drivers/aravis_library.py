@@ -12,10 +12,8 @@ INSTALL = (
     "docs/cameras.md"
 )
 #: Errors of Aravis (by name) that mean that the camera is gone or another program controls it.
-_GONE = (
-    "NOT_FOUND", "NOT_CONNECTED", "NOT_CONTROLLER", "TIMEOUT", "TRANSFER_ERROR",
-    "PROTOCOL_ERROR_ACCESS_DENIED",
-)  # fmt: skip
+_GONE = ["NOT_FOUND", "NOT_CONNECTED", "NOT_CONTROLLER", "TIMEOUT", "TRANSFER_ERROR"]
+_GONE.append("PROTOCOL_ERROR_ACCESS_DENIED")
 
 
 def load_aravis() -> Any:
@@ -52,6 +50,13 @@ def find_camera(aravis: Any, wanted: str) -> str:
 
     An address is returned as it is: asking there directly spares a second of discovery.
 
+    Parameters
+    ----------
+    aravis : module
+        The loaded library.
+    wanted : str
+        Id, serial number or address; empty for the first camera.
+
     Raises
     ------
     DeviceLost
@@ -74,7 +79,15 @@ def find_camera(aravis: Any, wanted: str) -> str:
 
 
 def is_gone(aravis: Any, error: Exception) -> bool:
-    """Whether an error of Aravis means that the camera is gone, or another program's."""
+    """Whether an error of Aravis means that the camera is gone, or another program's.
+
+    Parameters
+    ----------
+    aravis : module
+        The loaded library.
+    error : Exception
+        What it raised.
+    """
     if getattr(error, "domain", "") != "arv-device-error-quark":
         return False
     code = getattr(error, "code", None)

@@ -58,10 +58,8 @@ class Header:
 
     def pack(self) -> bytes:
         """Return the 40 bytes."""
-        return _HEADER.pack(
-            MAGIC, self.kind, self.pixel_bytes, 0, self.width, self.height, self.frame_id,
-            self.payload, self.stamp_ns, self.exposure_s,
-        )  # fmt: skip
+        image = (self.pixel_bytes, 0, self.width, self.height, self.frame_id)
+        return _HEADER.pack(MAGIC, self.kind, *image, self.payload, self.stamp_ns, self.exposure_s)
 
     @property
     def full_payload(self) -> int:
@@ -99,5 +97,13 @@ def reply(content: dict[str, Any]) -> bytes:
 
 
 def command(op: str, **fields: object) -> bytes:
-    """Return a command line."""
+    """Return a command line.
+
+    Parameters
+    ----------
+    op : str
+        Name of the command.
+    **fields
+        Its arguments, as JSON values.
+    """
     return json.dumps({"op": op, **fields}).encode() + b"\n"

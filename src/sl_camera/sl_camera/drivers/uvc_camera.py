@@ -42,7 +42,15 @@ class Capture(Protocol):
         ...
 
     def set(self, prop: int, value: float) -> bool:
-        """Set a property; the camera may take another value."""
+        """Set a property; the camera may take another value.
+
+        Parameters
+        ----------
+        prop : int
+            OpenCV's ``CAP_PROP_*``.
+        value : float
+            In OpenCV's unit of the property.
+        """
         ...
 
     def read(self) -> tuple[bool, NDArray[Any]]:

@@ -90,7 +90,7 @@ class ManualStage:
     def move_to(
         self, x_m: float, y_m: float, z_m: float, *, timeout_s: float | None = None
     ) -> None:
-        """Ask the operator to move, and wait for the confirmation."""
+        """See `StageDriver`; asks the operator to move, and waits for the confirmation."""
         with self._cv:
             self._require("idle")
             self._limits.require_inside((x_m, y_m, z_m))

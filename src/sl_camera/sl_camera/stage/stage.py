@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, get_args
 
 from sl_common.errors import DeviceRefused
 
@@ -17,15 +17,7 @@ Position = tuple[float, float, float]
 
 StateKind = Literal["idle", "moving", "hold", "alarm", "homing", "not_homed", "lost"]
 
-STATE_KINDS: tuple[StateKind, ...] = (
-    "idle",
-    "moving",
-    "hold",
-    "alarm",
-    "homing",
-    "not_homed",
-    "lost",
-)
+STATE_KINDS: tuple[StateKind, ...] = get_args(StateKind)
 
 AXES = ("x", "y", "z")
 

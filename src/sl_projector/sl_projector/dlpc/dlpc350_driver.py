@@ -17,7 +17,7 @@ from sl_common.errors import ConfigError, DeviceError, DeviceRefused, DeviceTime
 from sl_projector.dlpc import dlpc350_protocol as protocol
 from sl_projector.dlpc import dlpc900_protocol as common
 from sl_projector.dlpc.dlpc350_flash import Layout, flash_layout
-from sl_projector.dlpc.dlpc900_driver import Dlpc900, Dlpc900Settings
+from sl_projector.dlpc.dlpc900_driver import STATES, Dlpc900, Dlpc900Settings
 from sl_projector.dlpc.dlpc900_port import Dlpc900Port
 from sl_projector.dlpc.dmd import Loaded, LoadInfo, ProjectorStatus, Timing
 from sl_projector.sequence.pattern_sequence import PatternSequence
@@ -143,17 +143,14 @@ class Dlpc350(Dlpc900):
     def status(self) -> ProjectorStatus:
         """See `ProjectorDriver`."""
         port = self._opened()
-        names = (
-            common.HARDWARE_STATUS, common.SYSTEM_STATUS, common.MAIN_STATUS, common.POWER,
-        )  # fmt: skip
-        value = {name: port.read(name)[0] for name in names}
+        value = {name: port.read(name)[0] for name in STATES}
         return ProjectorStatus(
             model=self._model.name,
             firmware=common.firmware_version(port.read(common.VERSION, 4)),
             power="standby" if value[common.POWER] else "normal",
             running=bool(value[common.MAIN_STATUS] & common.MAIN_RUNNING),
             problems=self._problems(value),
-            registers={common.NAMES[name]: value[name] for name in names},
+            registers={common.NAMES[name]: value[name] for name in STATES},
         )
 
     def idle(self) -> None:
@@ -246,9 +243,12 @@ class Dlpc350(Dlpc900):
         before = -1
         for index, (image, plane) in enumerate(shown):
             word = protocol.pattern_word(
-                plane, leds=self._settings.leds, swap=image != before, black=timing.dark_us > 0,
+                plane,
+                leds=self._settings.leds,
+                swap=image != before,
+                black=timing.dark_us > 0,
                 trigger=self._trigger(index, count),
-            )  # fmt: skip
+            )
             port.write(protocol.VARIABLE_ADDRESS, index.to_bytes(2, "little"))
             entry = protocol.variable_entry(word, timing.exposure_us, period_us)
             port.write(protocol.VARIABLE_ENTRY, entry)

@@ -73,12 +73,28 @@ def pattern_word(plane: int, *, leds: int, swap: bool, black: bool, trigger: int
 
 
 def variable_entry(word: int, exposure_us: int, period_us: int) -> bytes:
-    """Pack a table entry (0x1A3E), 12 bytes."""
+    """Pack a table entry (0x1A3E), 12 bytes.
+
+    Parameters
+    ----------
+    word : int
+        From `pattern_word`.
+    exposure_us, period_us : int
+        Exposure, and exposure with the dark time after it, microseconds.
+    """
     return struct.pack("<III", word, exposure_us, period_us)
 
 
 def variable_config(entries: int, images: int, endless: bool) -> bytes:
-    """Pack the table's configuration (0x1A40); TRIG_OUT_2 marks every pattern."""
+    """Pack the table's configuration (0x1A40); TRIG_OUT_2 marks every pattern.
+
+    Parameters
+    ----------
+    entries, images : int
+        Number of table entries and of entries of the image table.
+    endless : bool
+        Repeat until stopped; otherwise once.
+    """
     return struct.pack("<HHBB", entries - 1, 0, images - 1, int(endless))
 
 

@@ -23,10 +23,11 @@ MAX_IMAGES = 18
 IMAGE_HEADER_BYTES = 48
 
 Words = NDArray[np.uint32]
+Bytes = NDArray[np.uint8]
 
 
 @kernel(error_model="python")
-def _set_plane(words, mirrors, plane):  # type: ignore[no-untyped-def]
+def _set_plane(words: Words, mirrors: Bytes, plane: int) -> None:
     for row in range(words.shape[0]):
         for column in range(words.shape[1]):
             if mirrors[row, column]:
@@ -45,7 +46,7 @@ def pack_planes(frames: Sequence[NDArray[np.uint8]]) -> Words:
 
 
 @kernel(error_model="python")
-def _put_pixel(out, at, word):  # type: ignore[no-untyped-def]
+def _put_pixel(out: Bytes, at: int, word: int) -> int:
     out[at] = (word >> 16) & 0xFF
     out[at + 1] = (word >> 8) & 0xFF
     out[at + 2] = word & 0xFF
@@ -53,7 +54,7 @@ def _put_pixel(out, at, word):  # type: ignore[no-untyped-def]
 
 
 @kernel(error_model="python")
-def _repeat_length(line, column, longest):  # type: ignore[no-untyped-def]
+def _repeat_length(line: Words, column: int, longest: int) -> int:
     end = min(line.size, column + longest)
     stop = column + 1
     while stop < end and line[stop] == line[column]:
@@ -62,7 +63,7 @@ def _repeat_length(line, column, longest):  # type: ignore[no-untyped-def]
 
 
 @kernel(error_model="python")
-def _copy_length(line, above, column, longest):  # type: ignore[no-untyped-def]
+def _copy_length(line: Words, above: Words, column: int, longest: int) -> int:
     end = min(line.size, column + longest)
     stop = column
     while stop < end and line[stop] == above[stop]:
@@ -71,7 +72,7 @@ def _copy_length(line, above, column, longest):  # type: ignore[no-untyped-def]
 
 
 @kernel(error_model="python")
-def _literal_length(line, above, column, longest, has_above):  # type: ignore[no-untyped-def]
+def _literal_length(line: Words, above: Words, column: int, longest: int, has_above: bool) -> int:
     # A literal run ends at a repeat or copy of two pixels or more: a single one saves nothing
     # once the next literal run's own count bytes are paid.
     end = min(line.size, column + longest)
@@ -86,14 +87,14 @@ def _literal_length(line, above, column, longest, has_above):  # type: ignore[no
 
 
 @kernel(error_model="python")
-def _put_literals(out, at, line, column, count):  # type: ignore[no-untyped-def]
+def _put_literals(out: Bytes, at: int, line: Words, column: int, count: int) -> int:
     for pixel in range(column, column + count):
         at = _put_pixel(out, at, line[pixel])
     return at
 
 
 @kernel(error_model="python")
-def _rle_line(out, at, line):  # type: ignore[no-untyped-def]
+def _rle_line(out: Bytes, at: int, line: Words) -> int:
     column = 0
     while column < line.size:
         count = _repeat_length(line, column, 255)
@@ -111,7 +112,7 @@ def _rle_line(out, at, line):  # type: ignore[no-untyped-def]
 
 
 @kernel(error_model="python")
-def _rle(words, out):  # type: ignore[no-untyped-def]
+def _rle(words: Words, out: Bytes) -> int:
     at = 0
     for row in range(words.shape[0]):
         at = _rle_line(out, at, words[row])
@@ -124,7 +125,7 @@ def _rle(words, out):  # type: ignore[no-untyped-def]
 
 
 @kernel(error_model="python")
-def _put_count(out, at, count):  # type: ignore[no-untyped-def]
+def _put_count(out: Bytes, at: int, count: int) -> int:
     if count < 128:
         out[at] = count
         return at + 1
@@ -134,7 +135,9 @@ def _put_count(out, at, count):  # type: ignore[no-untyped-def]
 
 
 @kernel(error_model="python")
-def _enhanced_run(out, at, line, above, column, has_above):  # type: ignore[no-untyped-def]
+def _enhanced_run(
+    out: Bytes, at: int, line: Words, above: Words, column: int, has_above: bool
+) -> tuple[int, int]:
     copies = _copy_length(line, above, column, line.size) if has_above else 0
     repeats = _repeat_length(line, column, line.size)
     if copies >= repeats:
@@ -151,7 +154,7 @@ def _enhanced_run(out, at, line, above, column, has_above):  # type: ignore[no-u
 
 
 @kernel(error_model="python")
-def _enhanced_rle(words, out):  # type: ignore[no-untyped-def]
+def _enhanced_rle(words: Words, out: Bytes) -> int:
     at = 0
     for row in range(words.shape[0]):
         column = 0
@@ -190,11 +193,20 @@ def encode_uncompressed(words: Words) -> bytes:
 
 
 def image_header(columns: int, rows: int, data_bytes: int, compression: int) -> bytes:
-    """Return the 48-byte header in the form that TI's own software writes."""
-    return struct.pack(
-        "<4sHHI8sIBBBHB18x",
-        b"Spld", columns, rows, data_bytes, b"\xff" * 8, 0, 1, compression, 1, 0, 1,
-    )  # fmt: skip
+    """Return the 48-byte header in the form that TI's own software writes.
+
+    Parameters
+    ----------
+    columns, rows : int
+        Size of the image, pixels.
+    data_bytes : int
+        Bytes after the header.
+    compression : {UNCOMPRESSED, RLE, ENHANCED_RLE}
+        How they are coded.
+    """
+    unused = b"\xff" * 8
+    fields = (b"Spld", columns, rows, data_bytes, unused, 0, 1, compression, 1, 0, 1)
+    return struct.pack("<4sHHI8sIBBBHB18x", *fields)
 
 
 def encode_image(words: Words) -> bytes:
@@ -281,6 +293,13 @@ def encode_patterns(patterns: Sequence[Pattern], model: DmdModel) -> tuple[bytes
     """Return an image's bytes, one stream for each controller (primary first).
 
     With two controllers each gets its half of the columns, with a header of its own.
+
+    Parameters
+    ----------
+    patterns : sequence of Pattern
+        Up to 24; the first is plane 0.
+    model : DmdModel
+        Size, and whether two controllers share the columns.
     """
     words = pack_planes([p.frame(model.size) for p in patterns])
     halves = np.hsplit(words, 2) if model.dual else [words]

@@ -36,18 +36,16 @@ from sl_projector.hid.usb_transport import open_usb
 from sl_projector.sequence.pattern_sequence import PatternSequence
 
 WAKE_TIMEOUT_S = 10.0
-EXTERNAL_TRIGGER_MARGIN_US = (
-    15  # TI's older SDK allows 120 us where 105 us are possible untriggered
-)
+# TI's older SDK allows 120 us where 105 us are possible untriggered.
+EXTERNAL_TRIGGER_MARGIN_US = 15
 _POLL_S = 0.05
 _END_POLL_S = 0.002
 _WAIT_MARGIN_S = 3.0
 # How much sooner than computed a run may end: host and device clocks, and the start's latency.
 _EARLY_S, _EARLY_RELATIVE = 0.005, 1e-3
 _IDLE_OFF_VALUES = (0, 3)  # older and newer firmware
-_STATES = (
-    protocol.HARDWARE_STATUS, protocol.SYSTEM_STATUS, protocol.MAIN_STATUS, protocol.POWER,
-)  # fmt: skip
+_REGISTERS = (protocol.HARDWARE_STATUS, protocol.SYSTEM_STATUS, protocol.MAIN_STATUS)
+STATES = (*_REGISTERS, protocol.POWER)
 
 
 @dataclass(frozen=True)
@@ -222,8 +220,7 @@ class Dlpc900:
         )
         for command, out in outputs:
             rising_us, falling_us = (
-                round(out.rising_delay_s * 1e6),
-                round(out.falling_delay_s * 1e6),
+                round(1e6 * delay_s) for delay_s in (out.rising_delay_s, out.falling_delay_s)
             )
             port.write(command, protocol.trigger_out(rising_us, falling_us, out.inverted))
         if (trigger := self._settings.trigger_in) is not None:
@@ -247,13 +244,13 @@ class Dlpc900:
         return self._port
 
     def _check_hardware(self, port: Dlpc900Port, step: str) -> None:
-        if problems := self._problems({name: port.read(name)[0] for name in _STATES}):
+        if problems := self._problems({name: port.read(name)[0] for name in STATES}):
             raise DeviceError(f"{port.chip} after {step}: {', '.join(problems)}")
 
     def status(self) -> ProjectorStatus:
         """See `ProjectorDriver`."""
         port = self._opened()
-        names = (protocol.ERROR_CODE, *_STATES, protocol.IDLE)
+        names = (protocol.ERROR_CODE, *STATES, protocol.IDLE)
         value = {name: port.read(name)[0] for name in names}
         tag = port.read(protocol.HARDWARE)[1:].split(b"\0")[0].decode("ascii", "replace")
         version = protocol.firmware_version(port.read(protocol.VERSION, 4))
@@ -375,13 +372,13 @@ class Dlpc900:
     def _define_patterns(
         self, port: Dlpc900Port, places: tuple[tuple[int, int], ...], timing: Timing
     ) -> None:
-        trigger = self._settings.trigger_in
+        trigger, leds = self._settings.trigger_in, self._settings.leds
         for index, (image, bit) in enumerate(places):
             triggered = trigger is not None and trigger.waits(index)
+            times_us = (timing.exposure_us, timing.dark_us)
             entry = protocol.lut_entry(
-                index, timing.exposure_us, timing.dark_us, image, bit,
-                leds=self._settings.leds, wait_trigger=triggered, clear=triggered,
-            )  # fmt: skip
+                index, *times_us, image, bit, leds=leds, wait_trigger=triggered, clear=triggered
+            )
             port.write(protocol.LUT_ENTRY, entry)
 
     def _send_images(self, port: Dlpc900Port, images: list[tuple[bytes, ...]]) -> None:

@@ -72,6 +72,18 @@ class Dlpc900Port:
     def read(self, command: int, size: int = 1) -> bytes:
         """Ask for data, at least ``size`` bytes; asked twice when the answer is lost.
 
+        Parameters
+        ----------
+        command : int
+            Number of the command.
+        size : int
+            Least number of bytes.
+
+        Returns
+        -------
+        bytes
+            All that the device sent, at most 60.
+
         Raises
         ------
         DeviceRefused
@@ -101,12 +113,26 @@ class Dlpc900Port:
         """Set something, confirmed by the device; repeated when the confirmation is lost.
 
         Only for commands of which a repetition changes nothing. Raises as `read`.
+
+        Parameters
+        ----------
+        command : int
+            Number of the command.
+        data : bytes
+            Its parameters.
         """
         with self._lock:
             self._refuse(command, self._twice(lambda: self._exchange(command, data, read=False)))
 
     def write_once(self, command: int, data: bytes) -> tuple[int, int]:
         """Set something that must not happen twice; return the host time of its transfer.
+
+        Parameters
+        ----------
+        command : int
+            Number of the command.
+        data : bytes
+            Its parameters.
 
         Returns
         -------
@@ -124,6 +150,15 @@ class Dlpc900Port:
 
         Nothing comes between the two, also not of another thread: the next command without an
         error would hide this one's.
+
+        Parameters
+        ----------
+        command : int
+            Number of the command.
+        data : bytes
+            Its parameters.
+        step : str
+            What is being done, for the message.
 
         Raises
         ------

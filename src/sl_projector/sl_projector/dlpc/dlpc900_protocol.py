@@ -120,6 +120,17 @@ class Reply:
 def message(command: int, data: bytes = b"", *, read: bool, reply: bool, sequence: int) -> bytes:
     """Return a message without padding, at most 512 bytes.
 
+    Parameters
+    ----------
+    command : int
+        16 bits.
+    data : bytes
+        At most 506 bytes.
+    read, reply : bool
+        Ask for data; ask for a confirmation (implied by ``read``).
+    sequence : int
+        Number that the reply repeats, 0 to 255.
+
     Raises
     ------
     DeviceError
@@ -196,12 +207,28 @@ def lut_entry(
 
 
 def lut_config(entries: int, exposures: int) -> bytes:
-    """Pack the pattern table configuration (0x1A31): exposures 0 repeats for ever."""
+    """Pack the pattern table configuration (0x1A31): exposures 0 repeats for ever.
+
+    Parameters
+    ----------
+    entries : int
+        Number of table entries.
+    exposures : int
+        Number of exposures; 0 repeats until stopped.
+    """
     return struct.pack("<HI", entries, exposures)
 
 
 def image_init(image: int, total_bytes: int) -> bytes:
-    """Pack an image load start (0x1A2A, 0x1A2C); the total includes the 48-byte header."""
+    """Pack an image load start (0x1A2A, 0x1A2C); the total includes the 48-byte header.
+
+    Parameters
+    ----------
+    image : int
+        Number of the image in the controller's memory.
+    total_bytes : int
+        Header and data.
+    """
     return struct.pack("<HI", image, total_bytes)
 
 
@@ -213,12 +240,28 @@ def image_chunks(stream: bytes) -> list[bytes]:
 
 
 def trigger_out(rising_us: int, falling_us: int, inverted: bool) -> bytes:
-    """Pack a trigger output's setting (0x1A1D, 0x1A1E)."""
+    """Pack a trigger output's setting (0x1A1D, 0x1A1E).
+
+    Parameters
+    ----------
+    rising_us, falling_us : int
+        Delays of the edges, microseconds.
+    inverted : bool
+        Active low.
+    """
     return struct.pack("<Bhh", int(inverted), rising_us, falling_us)
 
 
 def trigger_in(delay_us: int, falling_edge: bool) -> bytes:
-    """Pack trigger input 1's setting (0x1A35)."""
+    """Pack trigger input 1's setting (0x1A35).
+
+    Parameters
+    ----------
+    delay_us : int
+        From the edge to the exposure, microseconds.
+    falling_edge : bool
+        Otherwise the rising edge counts.
+    """
     return struct.pack("<HB", delay_us, int(falling_edge))
 
 
@@ -248,7 +291,15 @@ def firmware_version(data: bytes) -> str:
 
 
 def refusal(command: int, code: int, text: str = "") -> DeviceRefused:
-    """Make the exception for a refused command."""
+    """Make the exception for a refused command.
+
+    Parameters
+    ----------
+    command, code : int
+        The command and TI's error code.
+    text : str
+        The device's own words, if any.
+    """
     name = NAMES.get(command, "command")
     detail = ERRORS.get(code, "undefined error") + (f": {text}" if text else "")
     return DeviceRefused(f"DLPC900 refused 0x{command:04X} ({name}): error {code}, {detail}")

@@ -284,6 +284,13 @@ class ProjectorDriver(Protocol):
         Called before a run. Afterwards `run` with the same timing only has to start it. Loading
         what is loaded already sends nothing.
 
+        Parameters
+        ----------
+        sequence : PatternSequence
+            Made for the size of the DMD.
+        timing : Timing, optional
+            As loaded before, or the default.
+
         Raises
         ------
         SequenceError
@@ -301,6 +308,13 @@ class ProjectorDriver(Protocol):
         Called after `load`, with the camera armed. ``timing`` None keeps the one loaded;
         ``repeats`` 0 means until `stop`. Afterwards the first exposure has begun, or waits for
         the external trigger.
+
+        Parameters
+        ----------
+        timing : Timing, optional
+            As loaded if omitted.
+        repeats : int
+            0 runs until `stop`.
 
         Raises
         ------

@@ -84,11 +84,29 @@ class UsbLink(Protocol):
         ...
 
     def write(self, endpoint: int, report: bytes, timeout_ms: int) -> int:
-        """Send a report, return the bytes taken."""
+        """Send a report, return the bytes taken.
+
+        Parameters
+        ----------
+        endpoint : int
+            Address of the OUT endpoint.
+        report : bytes
+            At most 64 bytes.
+        timeout_ms : int
+            Longest wait, milliseconds.
+        """
         ...
 
     def read(self, endpoint: int, size: int, timeout_ms: int) -> bytes:
-        """Wait for a report, at most ``size`` bytes."""
+        """Wait for a report, at most ``size`` bytes.
+
+        Parameters
+        ----------
+        endpoint, size : int
+            Address of the IN endpoint; most bytes to take.
+        timeout_ms : int
+            Longest wait, milliseconds.
+        """
         ...
 
     def clear_halt(self, endpoint: int) -> None:
@@ -108,7 +126,7 @@ class UsbLink(Protocol):
         ...
 
 
-def receive_exactly(connection: socket.socket, count: int) -> bytes:
+def _receive_exactly(connection: socket.socket, count: int) -> bytes:
     """Read ``count`` bytes; ConnectionError when the other side has gone."""
     parts = bytearray()
     while len(parts) < count:
@@ -121,16 +139,24 @@ def receive_exactly(connection: socket.socket, count: int) -> bytes:
 
 def receive_frame(connection: socket.socket) -> bytes:
     """Read one length-prefixed frame; ConnectionError when it cannot be one."""
-    (length,) = LENGTH.unpack(receive_exactly(connection, LENGTH.size))
+    (length,) = LENGTH.unpack(_receive_exactly(connection, LENGTH.size))
     if length > MAX_FRAME_BYTES:
         raise ConnectionAbortedError(
             errno.ECONNABORTED, f"frame of {length} bytes; expected at most {MAX_FRAME_BYTES}"
         )
-    return receive_exactly(connection, length)
+    return _receive_exactly(connection, length)
 
 
 def send_frame(connection: socket.socket, frame: bytes) -> None:
-    """Send one length-prefixed frame."""
+    """Send one length-prefixed frame.
+
+    Parameters
+    ----------
+    connection : socket
+        Connected stream socket.
+    frame : bytes
+        At most `MAX_FRAME_BYTES`.
+    """
     connection.sendall(LENGTH.pack(len(frame)) + frame)
 
 
@@ -277,19 +303,19 @@ class LinkBackend(usb.backend.IBackend):  # type: ignore[misc]
         )  # fmt: skip
 
     def get_configuration_descriptor(self, dev: UsbLink, config: int) -> SimpleNamespace:
-        """Return the only configuration."""
+        """See `IBackend`: return the only configuration."""
         return (_CONFIGURATION,)[config]
 
     def get_interface_descriptor(
         self, dev: UsbLink, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        """Return the only interface."""
+        """See `IBackend`: return the only interface."""
         return ((_INTERFACE,)[intf],)[alt]
 
     def get_endpoint_descriptor(
         self, dev: UsbLink, ep: int, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        """Return the report endpoint out (0) or in (1)."""
+        """See `IBackend`: return the report endpoint out (0) or in (1)."""
         return SimpleNamespace(
             bLength=7, bDescriptorType=5, bEndpointAddress=(ENDPOINT_OUT, ENDPOINT_IN)[ep],
             bmAttributes=3, wMaxPacketSize=64, bInterval=1, bRefresh=0, bSynchAddress=0,
@@ -305,27 +331,27 @@ class LinkBackend(usb.backend.IBackend):  # type: ignore[misc]
         dev_handle.release()
 
     def set_configuration(self, dev_handle: UsbLink, config_value: int) -> None:
-        """Nothing to do: there is one configuration."""
+        """See `IBackend`: nothing to do: there is one configuration."""
 
     def get_configuration(self, dev_handle: UsbLink) -> int:
         """Return the only configuration's number."""
         return int(_CONFIGURATION.bConfigurationValue)
 
     def claim_interface(self, dev_handle: UsbLink, intf: int) -> None:
-        """Take the interface."""
+        """See `IBackend`: take the interface."""
         try:
             dev_handle.claim()
         except OSError as error:
             _reraise(error)
 
     def release_interface(self, dev_handle: UsbLink, intf: int) -> None:
-        """Give the interface back."""
+        """See `IBackend`: give the interface back."""
         dev_handle.release()
 
     def intr_write(
         self, dev_handle: UsbLink, ep: int, intf: int, data: array.array[int], timeout: int
     ) -> int:
-        """Send a report."""
+        """See `IBackend`: send a report."""
         try:
             return dev_handle.write(ep, bytes(data), timeout)
         except OSError as error:
@@ -334,7 +360,7 @@ class LinkBackend(usb.backend.IBackend):  # type: ignore[misc]
     def intr_read(
         self, dev_handle: UsbLink, ep: int, intf: int, size: array.array[int], timeout: int
     ) -> int:
-        """Receive a report into ``size`` (pyusb passes its buffer under that name)."""
+        """See `IBackend`: receive a report into ``size``, which is pyusb's buffer."""
         try:
             report = dev_handle.read(ep, len(size), timeout)
         except OSError as error:
@@ -343,28 +369,28 @@ class LinkBackend(usb.backend.IBackend):  # type: ignore[misc]
         return len(report)
 
     def clear_halt(self, dev_handle: UsbLink, ep: int) -> None:
-        """End a stall."""
+        """See `IBackend`: end a stall."""
         try:
             dev_handle.clear_halt(ep)
         except OSError as error:
             _reraise(error)
 
     def is_kernel_driver_active(self, dev_handle: UsbLink, intf: int) -> bool:
-        """Tell whether the kernel's driver holds the interface."""
+        """See `IBackend`: tell whether the kernel's driver holds the interface."""
         try:
             return dev_handle.kernel_driver_active()
         except OSError as error:
             _reraise(error)
 
     def detach_kernel_driver(self, dev_handle: UsbLink, intf: int) -> None:
-        """Take the interface from the kernel's driver."""
+        """See `IBackend`: take the interface from the kernel's driver."""
         try:
             dev_handle.detach_kernel_driver()
         except OSError as error:
             _reraise(error)
 
     def attach_kernel_driver(self, dev_handle: UsbLink, intf: int) -> None:
-        """Give the interface back to the kernel's driver."""
+        """See `IBackend`: give the interface back to the kernel's driver."""
         try:
             dev_handle.attach_kernel_driver()
         except OSError as error:
@@ -374,7 +400,7 @@ class LinkBackend(usb.backend.IBackend):  # type: ignore[misc]
         self, dev_handle: UsbLink, bmRequestType: int, bRequest: int, wValue: int, wIndex: int,
         data: array.array[int], timeout: int,
     ) -> int:  # fmt: skip
-        """Answer the request for a string descriptor; stall on anything else."""
+        """See `IBackend`: answer the request for a string descriptor; stall on anything else."""
         strings = {0x0300: bytes(_LANGUAGES)}
         strings[0x0300 | _SERIAL_STRING] = _string_descriptor(dev_handle.describe().serial)
         if (bmRequestType, bRequest) != (0x80, 6) or wValue not in strings:

@@ -25,7 +25,15 @@ class HidTransport(Protocol):
     """Reports of 64 bytes each way; the driver is its only user."""
 
     def write(self, report: bytes, timeout_s: float) -> None:
-        """Send one report. Raises DeviceTimeout, DeviceLost, DeviceError."""
+        """Send one report. Raises DeviceTimeout, DeviceLost, DeviceError.
+
+        Parameters
+        ----------
+        report : bytes
+            At most 64 bytes.
+        timeout_s : float
+            Longest wait, seconds.
+        """
         ...
 
     def read(self, timeout_s: float) -> bytes:
@@ -151,12 +159,10 @@ def open_usb(device: str, vendor: int, product: int, backend: Any = None) -> Usb
         raise ConfigError(f"device {device!r}; expected 'usb', 'usb:SERIAL' or 'socket:PATH'")
     if kind == "socket":
         backend = LinkBackend(SocketLink(name))
-    chosen = kind == "usb" and bool(name)
+    wanted = name if kind == "usb" else ""
+    match = {"custom_match": lambda one: serial_number(one) == wanted} if wanted else {}
     try:
-        found = usb.core.find(
-            idVendor=vendor, idProduct=product, backend=backend,
-            custom_match=(lambda one: serial_number(one) == name) if chosen else None,
-        )  # fmt: skip
+        found = usb.core.find(idVendor=vendor, idProduct=product, backend=backend, **match)
     except usb.core.NoBackendError as error:
         raise DeviceError("pyusb finds no libusb-1.0; install it (libusb-1.0-0)") from error
     except usb.core.USBError as error:

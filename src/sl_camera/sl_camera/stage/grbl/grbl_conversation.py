@@ -59,7 +59,15 @@ class Patience:
         self.idle_s = 0.0
 
     def spend(self, state: str, place: Triple | None) -> None:
-        """Count the time since the last call, by what the controller said meanwhile."""
+        """Count the time since the last call, by what the controller said meanwhile.
+
+        Parameters
+        ----------
+        state : str
+            State in the last report.
+        place : tuple of float or None
+            Machine position in it, millimetres.
+        """
         now = time.monotonic()
         spent, self._last = now - self._last, now
         if state not in ("Hold", "Door"):
@@ -427,12 +435,27 @@ class GrblConversation:
         return self._break
 
     def require_unbroken(self, breaks: int, what: str) -> None:
-        """DeviceError where there was an alarm or a reset since ``breaks`` was read."""
+        """DeviceError where there was an alarm or a reset since ``breaks`` was read.
+
+        Parameters
+        ----------
+        breaks : int
+            `breaks` as it was when the motion began.
+        what : str
+            What was expected before an alarm, for the message.
+        """
         if self._break != breaks:
             raise DeviceError(self.alarm or f"the controller was stopped before {what}")
 
     def wait_state(self, wanted: Callable[[Report], bool], what: str) -> None:
         """Ask for the status until it is as wanted.
+
+        Parameters
+        ----------
+        wanted : callable
+            Takes a `Report` and tells whether the wait is over.
+        what : str
+            The state in words, for the message.
 
         Raises
         ------

@@ -244,6 +244,15 @@ def machine_frame(
     axis homed in the negative direction (``$23``) has [0, travel]. Without homing, machine zero
     is where the stage stood at power-up: that is the stage's zero then, and the travel bounds it
     on both sides.
+
+    Parameters
+    ----------
+    settings : dict of int to float
+        The controller's ``$`` settings.
+    origin_mm : tuple of float or None
+        The stage's zero in machine coordinates; None for the default.
+    signs : tuple of int
+        1 or -1 per axis: direction of the stage's axis in machine coordinates.
     """
     travel = [abs(settings.get(130 + i, 0.0)) for i in range(len(AXES))]
     homing, directions = int(settings.get(22, 0)), int(settings.get(23, 0))

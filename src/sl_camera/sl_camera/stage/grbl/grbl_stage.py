@@ -204,7 +204,7 @@ class GrblStage:
     def move_to(
         self, x_m: float, y_m: float, z_m: float, *, timeout_s: float | None = None
     ) -> None:
-        """Move in a straight line to an absolute position and wait until the stage stands there.
+        """See `StageDriver`; moves in a straight line.
 
         Without ``timeout_s`` it waits for as long as the position changes.
         """
@@ -228,6 +228,13 @@ class GrblStage:
         """Start a relative motion and return; ``stop()`` ends it at any time.
 
         Unlike a move it cannot be held: ``hold`` ends a jog.
+
+        Parameters
+        ----------
+        dx_m, dy_m, dz_m : float
+            Distance in stage axes, metres.
+        speed_m_s : float
+            Along the path, metres per second.
 
         Raises
         ------

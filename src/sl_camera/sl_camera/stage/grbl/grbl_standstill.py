@@ -101,6 +101,13 @@ def wait_begin(talk: GrblConversation) -> None:
 def wait_idle(talk: GrblConversation, what: str) -> None:
     """Wait until the stage is idle and rests.
 
+    Parameters
+    ----------
+    talk : GrblConversation
+        The open controller.
+    what : str
+        What is waited for, for the message.
+
     Raises
     ------
     DeviceError
@@ -119,6 +126,15 @@ def wait_idle(talk: GrblConversation, what: str) -> None:
 
 def verify(talk: GrblConversation, target_mm: Triple, breaks: int) -> None:
     """The controller must stand where it was sent; there are some that are idle too early.
+
+    Parameters
+    ----------
+    talk : GrblConversation
+        The open controller.
+    target_mm : tuple of float
+        Machine position that was commanded, millimetres.
+    breaks : int
+        `GrblConversation.breaks` before the motion.
 
     Raises
     ------

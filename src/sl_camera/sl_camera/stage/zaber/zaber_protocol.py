@@ -55,7 +55,17 @@ def checksum(text: str) -> int:
 
 
 def command(device: int, axis: int, number: int, data: str) -> bytes:
-    """Encode a command, with message number and checksum, so that no stale reply is taken."""
+    """Encode a command, with message number and checksum, so that no stale reply is taken.
+
+    Parameters
+    ----------
+    device, axis : int
+        Address; axis 0 is the whole device.
+    number : int
+        Message number, 0 to 99.
+    data : str
+        Command and its arguments; empty asks for the status.
+    """
     body = f"{device:02d} {axis} {number:02d} {data}".rstrip()
     return f"/{body}:{checksum(body):02X}\n".encode("ascii")
 

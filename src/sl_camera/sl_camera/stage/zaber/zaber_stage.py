@@ -63,15 +63,23 @@ def zaber_axes(
 ) -> list[ZaberAxis]:
     """Axes x, y, z from lists as a configuration has them.
 
+    Parameters
+    ----------
+    devices, axes : sequence of int
+        Address and axis number of x, y, z.
+    microsteps_m : sequence of float
+        Metres per microstep.
+    signs : sequence of int
+        1 or -1: direction of the stage's axis on the device.
+
     Raises
     ------
     ConfigError
         When a list does not have three values.
     """
-    for name, values in (
-        ("zaber_devices", devices), ("zaber_axes", axes), ("zaber_microstep_m", microsteps_m),
-        ("signs", signs),
-    ):  # fmt: skip
+    given: dict[str, Sequence[float]] = {"zaber_devices": devices, "zaber_axes": axes}
+    given |= {"zaber_microstep_m": microsteps_m, "signs": signs}
+    for name, values in given.items():
         if len(values) != 3:
             raise ConfigError(f"{name} has {len(values)} values; expected one for each of x, y, z")
     each = zip(devices, axes, microsteps_m, signs, strict=True)
@@ -321,7 +329,7 @@ class ZaberStage:
     def move_to(
         self, x_m: float, y_m: float, z_m: float, *, timeout_s: float | None = None
     ) -> None:
-        """All axes at once to an absolute position; wait until all stand there."""
+        """See `StageDriver`; all axes start at once."""
         self.limits_m().require_inside((x_m, y_m, z_m))
         targets = [
             round(axis.sign * value / axis.microstep_m) + reach.origin
