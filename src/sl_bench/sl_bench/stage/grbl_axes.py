@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 from sl_bench.stage.grbl_motion import (
@@ -27,7 +28,7 @@ Event = Literal["", "started", "done", "braked", "empty", "homing", "homed", "no
 
 
 class GrblAxes:
-    """The mechanics and what drives them.
+    """The mechanics and their motion.
 
     Parameters
     ----------
@@ -66,17 +67,12 @@ class GrblAxes:
 
     @property
     def is_moving(self) -> bool:
-        """A block or a braking is under way; homing apart."""
+        """Whether a block or a braking is under way; homing does not count."""
         return self._profile is not None
 
     @property
-    def is_braking(self) -> bool:
-        """A halt is under way."""
-        return isinstance(self._profile, Braking)
-
-    @property
     def is_homing(self) -> bool:
-        """A homing cycle is under way."""
+        """Whether a homing cycle is under way."""
         return bool(self._legs)
 
     def speed_mm_s(self) -> float:
@@ -84,7 +80,7 @@ class GrblAxes:
         return self._profile.at(self.now - self._since)[1] if self._profile else 0.0
 
     def on_steps(self, place: Sequence[float]) -> Triple:
-        """The nearest place that is a whole number of steps from machine zero."""
+        """Return the nearest position that is a whole number of steps from machine zero."""
         x, y, z = (
             round(value * self._settings[100 + i]) / self._settings[100 + i]
             for i, value in enumerate(place)
@@ -92,18 +88,18 @@ class GrblAxes:
         return x, y, z
 
     def shows_pin(self, axis: int) -> bool:
-        """The axis' limit switch is closed."""
+        """Whether the axis' limit switch is closed."""
         return self._pressed(axis) or axis in self.closed_switches
 
     def _pressed(self, axis: int) -> bool:
-        """A switch sits just beyond either end of the travel."""
+        """Whether the carriage is at a switch: just beyond either end of the travel."""
         p, margin = self.carriage[axis], 1e-6
         return p > margin or p < -self._settings[130 + axis] - margin
 
     # -- orders -------------------------------------------------------------------------------
 
     def stop_dead(self) -> None:
-        """Everything planned is gone, nothing moves."""
+        """Stop at once and forget everything planned."""
         self.planner.clear()
         self._legs.clear()
         self._profile, self._done = None, 0.0
@@ -122,15 +118,17 @@ class GrblAxes:
         self._since = self.now
         self._legs = deque(homing_legs(self.carriage, self._settings, self.dead_switches))
 
-    def start_block(self, feed_share: float, rapid_share: float) -> bool:
-        """Begin the next block, or what a hold left of it; False where there is none."""
+    def start_block(self, feed_share: float) -> bool:
+        """Begin the next block, or what a hold left of it; False where there is none.
+
+        The feed override leaves jogs and rapid moves alone.
+        """
         if not self.planner or self._profile is not None:
             return False
         block, settings = self.planner[0], self._settings
+        if not block.is_jog:
+            block = replace(block, speed=block.speed * feed_share)
         x, y, z = (settings[110 + i] / 60.0 for i in range(3))
-        share = rapid_share if math.isinf(block.speed) else feed_share
-        if not block.is_jog:  # overrides leave jogs alone
-            block = block.overridden(share)
         accelerations = settings[120], settings[121], settings[122]
         self._profile = block.ramp(self._done, (x, y, z), accelerations)
         self._since = self.now
@@ -157,7 +155,7 @@ class GrblAxes:
     def _end_profile(self) -> Event:
         assert self._profile is not None
         self.now = max(self.now, self._since + self._profile.duration)
-        braked = self.is_braking
+        braked = isinstance(self._profile, Braking)
         self._done += self._profile.at(math.inf)[0]
         self._profile = None
         if not braked or self._done >= self.planner[0].length - 1e-9:
@@ -166,7 +164,7 @@ class GrblAxes:
         return "braked" if braked else "done"
 
     def _place(self, counter: Triple) -> bool:
-        """The counter moves, and the carriage as far as mechanics follow; True: hard limit."""
+        """Move the counter, and the carriage as far as it follows; True at a hard limit."""
         if self.stuck:
             return False
         step = [b - a for a, b in zip(self.counter, counter, strict=True)]

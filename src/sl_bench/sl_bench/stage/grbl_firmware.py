@@ -14,7 +14,6 @@ from sl_bench.stage.grbl_gcode import GcodeCommand, GrblError, Modes, clean, par
 from sl_bench.stage.grbl_motion import Block, Triple
 
 VERSION = "1.1h"
-BUILD = "20190830"
 RX_BYTES = 128
 LINE_CHARS = 79
 PLANNER_BLOCKS = 15
@@ -37,28 +36,22 @@ class GrblFirmware:
     ----------
     settings : dict, optional
         ``$n`` values that differ from ``STAGE_SETTINGS``.
-    carriage_mm : tuple of float, optional
-        Where the axes stand, mm from the home switches; by default the middle of the travel.
     homed : bool
-        Start as after homing, idle; otherwise as after power-up.
+        Start as after homing, idle; otherwise as after power-up. The axes stand in the middle of
+        their travel either way.
     now : float
         Time of the start, seconds.
     """
 
     def __init__(
-        self,
-        settings: dict[int, float] | None = None,
-        *,
-        carriage_mm: Triple | None = None,
-        homed: bool = False,
-        now: float = 0.0,
+        self, settings: dict[int, float] | None = None, *, homed: bool = False, now: float = 0.0
     ) -> None:
         self.settings = STAGE_SETTINGS | (settings or {})
         middle = (-self.settings[130] / 2, -self.settings[131] / 2, -self.settings[132] / 2)
-        carriage = carriage_mm or middle
-        self.axes = GrblAxes(self.settings, carriage, carriage if homed else (0.0, 0.0, 0.0), now)
+        self.axes = GrblAxes(self.settings, middle, middle if homed else (0.0, 0.0, 0.0), now)
         self._modes = Modes()
         self._out = bytearray()
+        #: ``Idle``, ``Run``, ``Hold``, ``Jog``, ``Alarm``, ``Home`` or ``Check``.
         self._state = "Idle"
         self._boot(locked=not homed and bool(self.settings[22]))
 
@@ -72,7 +65,7 @@ class GrblFirmware:
         self._owes_ok = False
         self._status_wanted = False
         self._wco_in = self._ov_in = 0
-        self._overrides = [100, 100]
+        self._feed_percent = 100
         self._target = list(self.axes.counter)
         self._modes.reset()
         self._say("", f"Grbl {VERSION} ['$' for help]")
@@ -80,21 +73,12 @@ class GrblFirmware:
         if locked:
             self._say("[MSG:'$H'|'$X' to unlock]")
 
-    # -- what the world and the tests see -------------------------------------------------------
+    # -- what the world sees ------------------------------------------------------------------
 
     def carriage_mm(self, now: float) -> Triple:
         """Where the axes really stand at ``now``, mm from the home switches."""
         self.advance(now)
         return self.axes.carriage
-
-    def counter_mm(self) -> Triple:
-        """Where the controller believes that it stands (MPos), to a step."""
-        return self.axes.on_steps(self.axes.counter)
-
-    @property
-    def state(self) -> str:
-        """``Idle``, ``Run``, ``Hold``, ``Jog``, ``Alarm``, ``Home``, ``Check`` or ``Sleep``."""
-        return self._state
 
     def take_output(self) -> bytes:
         """Bytes for the host since the last call."""
@@ -109,7 +93,7 @@ class GrblFirmware:
     # -- faults -------------------------------------------------------------------------------
 
     def power_cycle(self) -> None:
-        """Mains gone and back: the counter starts at zero wherever the carriage is."""
+        """Switch off and on: the counter starts at zero wherever the carriage is."""
         self.axes.stop_dead()
         self.axes.counter = (0.0, 0.0, 0.0)
         self._modes = Modes()
@@ -126,7 +110,7 @@ class GrblFirmware:
             self._critical = True
 
     def close_switch(self, axis: int) -> None:
-        """A limit switch closes, whatever the place; with hard limits on that is alarm 1."""
+        """Close a limit switch, wherever the carriage is; with hard limits on that is alarm 1."""
         self.axes.closed_switches.add(axis)
         if self.settings[21] and self._state not in ("Alarm", "Home") and not self._critical:
             self.alarm(1)
@@ -147,7 +131,15 @@ class GrblFirmware:
         self._read_lines()
 
     def receive(self, data: bytes, now: float) -> None:
-        """Bytes from the host: real-time commands act at once, the rest goes to the buffer."""
+        """Take bytes of the host: real-time commands act at once, others go to the buffer.
+
+        Parameters
+        ----------
+        data : bytes
+            As received; what does not fit into the buffer is lost.
+        now : float
+            Time, seconds.
+        """
         self.advance(now)
         for byte in data:
             if not self._realtime(byte) and len(self._rx) < RX_BYTES:
@@ -177,7 +169,7 @@ class GrblFirmware:
     def _start_block(self) -> bool:
         if self._state not in ("Idle", "Run", "Jog") or self.axes.is_moving:
             return False
-        if self.axes.start_block(self._overrides[0] / 100.0, self._overrides[1] / 100.0):
+        if self.axes.start_block(self._feed_percent / 100.0):
             self._state = "Jog" if self.axes.planner[0].is_jog else "Run"
             return True
         self._state = "Idle"
@@ -196,8 +188,8 @@ class GrblFirmware:
         }
         if byte in actions:
             actions[byte]()
-        elif 0x90 <= byte <= 0x97:
-            self._override(byte)
+        elif 0x90 <= byte <= 0x94:
+            self._override_feed(byte)
         return byte in actions or byte >= 0x80
 
     def _want_status(self) -> None:
@@ -219,13 +211,9 @@ class GrblFirmware:
         if self._state == "Hold" and not self.axes.is_moving:
             self._state = "Idle"
 
-    def _override(self, byte: int) -> None:
-        feed = self._overrides[0]
-        if byte <= 0x94:
-            change = {0x90: 100 - feed, 0x91: 10, 0x92: -10, 0x93: 1, 0x94: -1}[byte]
-            self._overrides[0] = min(max(feed + change, 10), 200)
-        else:
-            self._overrides[1] = {0x95: 100, 0x96: 50, 0x97: 25}[byte]
+    def _override_feed(self, byte: int) -> None:
+        change = (100 - self._feed_percent, 10, -10, 1, -1)[byte - 0x90]
+        self._feed_percent = min(max(self._feed_percent + change, 10), 200)
         self._ov_in = 0
 
     def _reset(self) -> None:
@@ -236,9 +224,8 @@ class GrblFirmware:
             self.alarm(3)
         if self._owes_ok:
             self._say("ok")
-        locked = self._state in ("Alarm", "Sleep")
         self._stop_dead()
-        self._boot(locked=locked)
+        self._boot(locked=self._state == "Alarm")
 
     # -- reports ------------------------------------------------------------------------------
 
@@ -247,7 +234,7 @@ class GrblFirmware:
         state = self._state
         if state == "Hold":
             state = "Hold:0" if not self.axes.is_moving else "Hold:1"
-        machine = self.counter_mm()
+        machine = self.axes.on_steps(self.axes.counter)
         offset = self._modes.work_offset()
         in_work = not int(self.settings[10]) & 1
         shown = [m - o for m, o in zip(machine, offset, strict=True)] if in_work else list(machine)
@@ -273,7 +260,7 @@ class GrblFirmware:
             self._ov_in -= 1
         else:
             self._ov_in = 19 if busy else 9
-            yield f"Ov:{self._overrides[0]},{self._overrides[1]},100"
+            yield f"Ov:{self._feed_percent},100,100"
 
     def _numbers(self, values: list[float]) -> str:
         if self.settings[13]:
@@ -283,8 +270,8 @@ class GrblFirmware:
     # -- lines --------------------------------------------------------------------------------
 
     def _read_lines(self) -> None:
-        """Take lines from the buffer for as long as nothing holds the reader up."""
-        while not self._critical and self._state not in ("Hold", "Home", "Sleep"):
+        """Take lines from the buffer until something holds the reader up."""
+        while not self._critical and self._state not in ("Hold", "Home"):
             if self._pending is not None:
                 if not self._pending():
                     return
@@ -321,11 +308,11 @@ class GrblFirmware:
         else:
             self._execute(parse(line, self._modes, self._target), is_jog=False)
 
-    def _execute(self, order: GcodeCommand, *, is_jog: bool) -> None:
-        if order.dwell_s is not None:
-            self._dwell(order.dwell_s)
-        elif order.target is not None:
-            self._line_to(order.target, order.feed, is_jog=is_jog)
+    def _execute(self, command: GcodeCommand, *, is_jog: bool) -> None:
+        if command.dwell_s is not None:
+            self._dwell(command.dwell_s)
+        elif command.target is not None:
+            self._line_to(command.target, command.feed, is_jog=is_jog)
 
     def _dwell(self, seconds: float) -> None:
         """``G4`` waits for the planner to run empty, then for its own time."""
@@ -362,7 +349,7 @@ class GrblFirmware:
         )
 
     def _soft_limit(self) -> None:
-        """What runs is halted smoothly first, so that the position is kept; then alarm 2."""
+        """Halt smoothly first, so that the position is kept; then alarm 2."""
         if self.axes.is_moving:
             self.axes.brake()
             self._state, self._alarm_when_halted = "Hold", True
@@ -380,8 +367,8 @@ class GrblFirmware:
             self._query(line)
         elif self._state not in ("Idle", "Alarm"):
             raise GrblError(8)
-        elif line in ("$H", "$I", "$#", "$N", "$SLP"):
-            self._idle_command(line)
+        elif line == "$H":
+            self._home()
         else:
             self._write_setting(line)
 
@@ -392,7 +379,7 @@ class GrblFirmware:
 
     def _query(self, line: str) -> None:
         if line == "$":
-            self._say("[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]")
+            self._say("[HLP:$$ $G $x=val $J=line $C $X $H ~ ! ? ctrl-x]")
         elif line == "$X":
             if self._state == "Alarm":
                 self._say("[MSG:Caution: Unlocked]")
@@ -400,8 +387,8 @@ class GrblFirmware:
         elif line == "$G":
             m = self._modes
             self._say(
-                f"[GC:G{m.motion:g} G{m.coordinates:g} G17 G{m.units:g} G{m.distance:g} G94 "
-                f"M5 M9 T0 F{m.feed:g} S0]"
+                f"[GC:{m.motion} {m.coordinates} G17 {m.units} {m.distance} G94 M5 M9 T0 "
+                f"F{m.feed:g} S0]"
             )
         elif self._state == "Run":
             raise GrblError(8)
@@ -419,21 +406,6 @@ class GrblFirmware:
             self._state = "Check"
         else:
             raise GrblError(8)
-
-    def _idle_command(self, line: str) -> None:
-        if line == "$I":
-            self._say(f"[VER:{VERSION}.{BUILD}:]", f"[OPT:V,{PLANNER_BLOCKS},{RX_BYTES}]")
-        elif line == "$N":
-            self._say("$N0=", "$N1=")
-        elif line == "$#":
-            for g, values in self._modes.offsets.items():
-                self._say(f"[G{g:g}:{self._numbers(values)}]")
-            self._say("[TLO:0.000]", "[PRB:0.000,0.000,0.000:0]")
-        elif line == "$SLP":
-            self._say("[MSG:Sleeping]")
-            self._state = "Sleep"
-        else:
-            self._home()
 
     def _home(self) -> None:
         if not self.settings[22]:

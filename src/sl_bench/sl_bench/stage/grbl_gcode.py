@@ -6,27 +6,22 @@ Source: gnea/grbl 1.1h, ``doc/markdown/interface.md`` (error codes) and ``comman
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 AXIS_WORDS = "XYZ"
-MODAL_GROUPS: dict[str, frozenset[float]] = {
-    "motion": frozenset({0, 1, 80}),
-    "plane": frozenset({17, 18, 19}),
-    "distance": frozenset({90, 91}),
-    "arc distance": frozenset({91.1}),
-    "feed mode": frozenset({93, 94}),
-    "units": frozenset({20, 21}),
-    "cutter": frozenset({40}),
-    "tool length": frozenset({49}),
-    "coordinates": frozenset({54, 55, 56, 57, 58, 59}),
-    "non-modal": frozenset({4, 10, 28, 30, 53, 92, 92.1}),
+_GROUPS = {
+    "motion": "G0 G1 G80",
+    "plane": "G17 G18 G19",
+    "distance": "G90 G91",
+    "feed mode": "G94",
+    "units": "G20 G21",
+    "coordinates": "G54 G55 G56 G57 G58 G59",
+    "non-modal": "G4 G10 G53 G92 G92.1",
+    "spindle": "M5",
+    "coolant": "M9",
 }
-M_GROUPS: dict[str, frozenset[float]] = {
-    "program": frozenset({0, 1, 2, 30}),
-    "spindle": frozenset({3, 4, 5}),
-    "coolant": frozenset({7, 8, 9}),
-}
-JOG_CODES = frozenset({20, 21, 53, 90, 91})
+_GROUP_OF = {code: name for name, codes in _GROUPS.items() for code in codes.split()}
+JOG_CODES = frozenset({"G20", "G21", "G53", "G90", "G91"})
 _WORD = re.compile(r"([A-Z])([-+]?(?:\d+\.?\d*|\.\d+))")
 
 
@@ -42,24 +37,24 @@ class GrblError(Exception):
 class Modes:
     """What the parser remembers from line to line."""
 
-    motion: float = 0
-    distance: float = 90
-    units: float = 21
-    coordinates: float = 54
+    motion: str = "G0"
+    distance: str = "G90"
+    units: str = "G21"
+    coordinates: str = "G54"
     feed: float = 0.0
-    offsets: dict[float, list[float]] = field(
-        default_factory=lambda: {g: [0.0, 0.0, 0.0] for g in (54, 55, 56, 57, 58, 59, 92)}
+    offsets: dict[str, list[float]] = field(
+        default_factory=lambda: {g: [0.0] * 3 for g in [*_GROUPS["coordinates"].split(), "G92"]}
     )
 
     def reset(self) -> None:
-        """Modes after a reset; G92 goes, the stored coordinate systems stay."""
-        self.motion, self.distance, self.units, self.coordinates, self.feed = 0, 90, 21, 54, 0.0
-        self.offsets[92] = [0.0, 0.0, 0.0]
+        """Modes after a reset; G92 is lost, the stored coordinate systems stay."""
+        self.offsets["G92"] = [0.0] * 3
+        self.__dict__.update(vars(Modes(offsets=self.offsets)))
 
     def work_offset(self) -> list[float]:
         """WCO = MPos - WPos, mm."""
         stored = self.offsets[self.coordinates]
-        return [a + b for a, b in zip(stored, self.offsets[92], strict=True)]
+        return [a + b for a, b in zip(stored, self.offsets["G92"], strict=True)]
 
 
 @dataclass(frozen=True)
@@ -82,17 +77,17 @@ class GcodeCommand:
 
 
 def clean(line: str) -> str:
-    """Drop blanks and comments, and upper the case, as GRBL's line reader does."""
-    return re.sub(r"\([^)]*\)?|;.*", "", line).replace(" ", "").replace("\t", "").upper()
+    """Drop blanks and comments and make it upper case, as GRBL's line reader does."""
+    return re.sub(r"\([^)]*\)?|;.*|[ \t]", "", line).upper()
 
 
 def parse(line: str, modes: Modes, position: list[float], *, jog: bool = False) -> GcodeCommand:
-    """Read a cleaned line, update the modes (not for a jog) and say what to do.
+    """Read a cleaned line, update the modes (not for a jog) and return what to do.
 
     Parameters
     ----------
     line : str
-        After ``clean``; without ``$J=``.
+        After `clean`; without ``$J=``.
     modes : Modes
         Changed in place, unless the line is refused.
     position : list of float
@@ -107,54 +102,48 @@ def parse(line: str, modes: Modes, position: list[float], *, jog: bool = False) 
     """
     codes, words = _split(line)
     if jog:
-        if not {("G", c) for c in JOG_CODES} >= codes or set(words) - set("XYZFN"):
+        if not JOG_CODES.issuperset(codes.values()) or set(words) - set("XYZFN"):
             raise GrblError(16)
-        modes = Modes(1, modes.distance, modes.units, modes.coordinates, 0.0, modes.offsets)
-    _check(codes, words)
-    groups = {_group(letter, code): code for letter, code in codes}
-    units = groups.get("units", modes.units)
-    scale = 25.4 if units == 20 else 1.0
-    wanted = Modes(
-        motion=groups.get("motion", modes.motion),
-        distance=groups.get("distance", modes.distance),
-        units=units,
-        coordinates=groups.get("coordinates", modes.coordinates),
-        feed=words["F"] * scale if "F" in words else modes.feed,
-        offsets=modes.offsets,
-    )
+        modes = replace(modes, motion="G1", feed=0.0)
+    _check(set(codes.values()), words)
+    modal = {name: code for name, code in codes.items() if name in vars(modes)}
+    wanted = replace(modes, **modal)  # type: ignore[arg-type]
+    scale = 25.4 if wanted.units == "G20" else 1.0
+    if "F" in words:
+        wanted.feed = words["F"] * scale
     axes = {AXIS_WORDS.index(a): words[a] * scale for a in AXIS_WORDS if a in words}
-    order = _order(groups.get("non-modal"), words, axes, wanted, position)
-    if jog and order.target is None:
+    command = _command(codes.get("non-modal"), words, axes, wanted, position)
+    if jog and command.target is None:
         raise GrblError(26)
-    modes.__dict__.update(wanted.__dict__)
-    return order
+    modes.__dict__.update(vars(wanted))
+    return command
 
 
-def _order(
-    non_modal: float | None,
+def _command(
+    non_modal: str | None,
     words: dict[str, float],
     axes: dict[int, float],
     modes: Modes,
     position: list[float],
 ) -> GcodeCommand:
-    if non_modal == 4:
+    if non_modal == "G4":
         return GcodeCommand(dwell_s=words["P"])
-    if non_modal in (10, 92, 92.1):
+    if non_modal in ("G10", "G92", "G92.1"):
         _set_offset(non_modal, words, axes, modes, position)
         return GcodeCommand()
     if not axes:
         return GcodeCommand()
-    if modes.motion == 80:
+    if modes.motion == "G80":
         raise GrblError(31)
-    if modes.motion == 1 and modes.feed <= 0.0:
+    if modes.motion == "G1" and modes.feed <= 0.0:
         raise GrblError(22)
-    target = _target(axes, modes, position, non_modal == 53)
-    return GcodeCommand(target=target, feed=modes.feed if modes.motion == 1 else 0.0)
+    target = _target(axes, modes, position, non_modal == "G53")
+    return GcodeCommand(target=target, feed=modes.feed if modes.motion == "G1" else 0.0)
 
 
-def _split(line: str) -> tuple[set[tuple[str, float]], dict[str, float]]:
-    """Words of a line; G and M apart, because they may come more than once."""
-    codes: set[tuple[str, float]] = set()
+def _split(line: str) -> tuple[dict[str, str], dict[str, float]]:
+    """G and M codes by their modal group, one of each, and the values of the other words."""
+    codes: dict[str, str] = {}
     words: dict[str, float] = {}
     at = 0
     while at < len(line):
@@ -164,7 +153,12 @@ def _split(line: str) -> tuple[set[tuple[str, float]], dict[str, float]]:
         letter, value = match[1], float(match[2])
         at = match.end()
         if letter in "GM":
-            _add_code(codes, letter, value)
+            code = f"{letter}{value:g}"
+            if code not in _GROUP_OF:
+                raise GrblError(20)
+            if _GROUP_OF[code] in codes:
+                raise GrblError(21)
+            codes[_GROUP_OF[code]] = code
         elif letter in words:
             raise GrblError(25)
         else:
@@ -172,38 +166,21 @@ def _split(line: str) -> tuple[set[tuple[str, float]], dict[str, float]]:
     return codes, words
 
 
-def _add_code(codes: set[tuple[str, float]], letter: str, value: float) -> None:
-    group = _group(letter, value)
-    if group in {_group(*code) for code in codes}:
-        raise GrblError(21)
-    codes.add((letter, value))
-
-
-def _group(letter: str, value: float) -> str:
-    for name, members in (MODAL_GROUPS if letter == "G" else M_GROUPS).items():
-        if value in members:
-            return name
-    raise GrblError(20 if value == int(value) or letter == "G" else 23)
-
-
-def _check(codes: set[tuple[str, float]], words: dict[str, float]) -> None:
+def _check(codes: set[str], words: dict[str, float]) -> None:
     """Rules that need no modes: unknown and missing words, negative values."""
     if set(words) - set("XYZFSTNPLIJK"):
         raise GrblError(20)
     if any(words.get(letter, 0.0) < 0.0 for letter in "FSTNP"):
         raise GrblError(4)
-    if ("G", 4) in codes and "P" not in words:
+    needed = set("LP") if "G10" in codes else set("P") if "G4" in codes else set()
+    if needed - set(words):
         raise GrblError(28)
-    has_axes = any(axis in words for axis in AXIS_WORDS)
-    if ("G", 10) in codes and not {"L", "P"} <= set(words):
-        raise GrblError(28)
-    setters = {("G", 10), ("G", 92)} & codes
-    if setters and not has_axes:
-        raise GrblError(26)
-    if setters and {("G", 0), ("G", 1)} & codes:
-        raise GrblError(24)
-    used = set("XYZFSTN") | ({"P"} if {("G", 4), ("G", 10)} & codes else set())
-    if set(words) - used - ({"L"} if ("G", 10) in codes else set()):
+    if codes & {"G10", "G92"}:
+        if not set(AXIS_WORDS) & set(words):
+            raise GrblError(26)
+        if codes & {"G0", "G1"}:
+            raise GrblError(24)
+    if set(words) - set("XYZFSTN") - needed:
         raise GrblError(36)
 
 
@@ -211,30 +188,28 @@ def _target(
     axes: dict[int, float], modes: Modes, position: list[float], machine: bool
 ) -> list[float]:
     offset = [0.0, 0.0, 0.0] if machine else modes.work_offset()
+    # G53 is absolute whatever the distance mode.
+    relative = modes.distance == "G91" and not machine
     target = list(position)
     for axis, value in axes.items():
-        # G53 is absolute whatever the distance mode
-        relative = modes.distance == 91 and not machine
         target[axis] = position[axis] + value if relative else value + offset[axis]
     return target
 
 
 def _set_offset(
-    code: float, words: dict[str, float], axes: dict[int, float], modes: Modes, here: list[float]
+    code: str, words: dict[str, float], axes: dict[int, float], modes: Modes, here: list[float]
 ) -> None:
     """G10 L2/L20 and G92: change a coordinate system so that the given values hold."""
-    if code == 92.1:
-        modes.offsets[92] = [0.0, 0.0, 0.0]
+    if code == "G92.1":
+        modes.offsets["G92"] = [0.0] * 3
         return
-    if code == 10 and words["L"] not in (2, 20):
+    if code == "G10" and words["L"] not in (2, 20):
         raise GrblError(20)
-    system = modes.coordinates if code == 92 or not words["P"] else 53 + words["P"]
+    system = modes.coordinates if code == "G92" or not words["P"] else f"G{53 + words['P']:g}"
     if system not in modes.offsets:
         raise GrblError(29)
+    changed, other = ("G92", system) if code == "G92" else (system, "G92")
     for axis, value in axes.items():
-        if code == 92:
-            modes.offsets[92][axis] = here[axis] - modes.offsets[system][axis] - value
-        elif words["L"] == 2:
-            modes.offsets[system][axis] = value
-        else:
-            modes.offsets[system][axis] = here[axis] - modes.offsets[92][axis] - value
+        stored = code == "G10" and words["L"] == 2
+        offset = value if stored else here[axis] - modes.offsets[other][axis] - value
+        modes.offsets[changed][axis] = offset

@@ -7,8 +7,8 @@ GRBL's look-ahead do not matter here. Lengths in millimetres, times in seconds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 Triple = tuple[float, float, float]
 
@@ -28,7 +28,7 @@ class Ramp:
 
     @property
     def duration(self) -> float:
-        """Length over peak speed, plus one acceleration time."""
+        """Length over peak speed, plus one time of acceleration."""
         if self.length == 0.0:
             return 0.0
         return self.length / self.peak + self.peak / self.acceleration
@@ -77,21 +77,12 @@ class Block:
         Programmed speed, mm/s; infinite for a rapid move.
     is_jog : bool
         It came from ``$J=``.
-    rate_share : float
-        Share of the axes' rates that it may use.
     """
 
     start: Triple
     target: Triple
     speed: float
     is_jog: bool
-    rate_share: float = 1.0
-
-    def overridden(self, share: float) -> Block:
-        """The same line at a share of its speed; a rapid one at a share of the axes' rates."""
-        if math.isinf(self.speed):
-            return replace(self, rate_share=share)
-        return replace(self, speed=self.speed * share)
 
     @property
     def length(self) -> float:
@@ -99,11 +90,19 @@ class Block:
         return math.dist(self.start, self.target)
 
     def ramp(self, done: float, rates: Triple, accelerations: Triple) -> Ramp:
-        """Profile of what is left after ``done`` mm, within each axis' rate and acceleration."""
+        """Profile of what is left of the line, within what each axis can do.
+
+        Parameters
+        ----------
+        done : float
+            Length behind, mm.
+        rates, accelerations : tuple of float
+            Of the axes, mm/s and mm/s^2.
+        """
         shares = [abs(b - a) / self.length for a, b in zip(self.start, self.target, strict=True)]
         speed = min(r / s for r, s in zip(rates, shares, strict=True) if s > 0)
         acceleration = min(a / s for a, s in zip(accelerations, shares, strict=True) if s > 0)
-        return Ramp(self.length - done, min(speed * self.rate_share, self.speed), acceleration)
+        return Ramp(self.length - done, min(speed, self.speed), acceleration)
 
     def point(self, done: float) -> Triple:
         """Position after ``done`` mm."""
@@ -156,21 +155,26 @@ def homing_legs(
     """Legs of ``$H`` from where the carriage stands: Z, then X and Y together.
 
     Seek the switch at ``$25``, pull off by ``$27``, locate it at ``$24``, pull off; ``$26`` after
-    each. Switches are at 0, or at -travel for the axes in ``$23``. An axis whose switch is dead
-    ends the cycle with alarm 9 after 1.5 times its travel.
+    each. Switches are at 0, or at -travel for the axes in ``$23``.
+
+    Parameters
+    ----------
+    place : tuple of float
+        Where the carriage stands, mm.
+    settings : dict
+        GRBL's ``$n``.
+    dead_switches : frozenset of int
+        Axes whose switch never closes: the cycle ends with alarm 9 after 1.5 times their travel.
     """
     seek, locate = settings[25] / 60.0, settings[24] / 60.0
     legs: list[HomingLeg] = []
     for axes in ((2,), (0, 1)):
-        dead = [axis for axis in axes if axis in dead_switches]
+        dead = dead_switches.intersection(axes)
         if dead:
-            away = _with(
-                place, dead, lambda i, p: p + 1.5 * _towards(i, settings) * settings[130 + i]
-            )
-            legs.append(HomingLeg(place, away, seek, 0.0, alarm=9))
-            return legs
-        at_switch = _with(place, axes, lambda i, _: _switch(i, settings))
-        pulled = _with(place, axes, lambda i, _: _pulled_off(i, settings))
+            beyond = {i: place[i] + 1.5 * _towards(i, settings) * settings[130 + i] for i in dead}
+            return [*legs, HomingLeg(place, _with(place, beyond), seek, 0.0, alarm=9)]
+        at_switch = _with(place, {i: _switch(i, settings) for i in axes})
+        pulled = _with(place, {i: _pulled_off(i, settings) for i in axes})
         stops = (at_switch, pulled, at_switch, pulled)
         for target, rate in zip(stops, (seek, seek, locate, seek), strict=True):
             legs.append(HomingLeg(place, target, rate, settings[26] * 1e-3))
@@ -180,7 +184,7 @@ def homing_legs(
 
 def homed_position(settings: dict[int, float]) -> Triple:
     """Machine position after homing: the pull-off away from the switch."""
-    return _with((0.0, 0.0, 0.0), (0, 1, 2), lambda i, _: _pulled_off(i, settings))
+    return _with((0.0, 0.0, 0.0), {i: _pulled_off(i, settings) for i in range(3)})
 
 
 def _towards(axis: int, settings: dict[int, float]) -> float:
@@ -195,8 +199,6 @@ def _pulled_off(axis: int, settings: dict[int, float]) -> float:
     return _switch(axis, settings) - _towards(axis, settings) * settings[27]
 
 
-def _with(place: Triple, axes: Sequence[int], new: Callable[[int, float], float]) -> Triple:
-    values = list(place)
-    for axis in axes:
-        values[axis] = new(axis, values[axis])
-    return values[0], values[1], values[2]
+def _with(place: Triple, changed: Mapping[int, float]) -> Triple:
+    x, y, z = (changed.get(axis, value) for axis, value in enumerate(place))
+    return x, y, z

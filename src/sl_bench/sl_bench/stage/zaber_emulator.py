@@ -10,12 +10,11 @@ import re
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
-from types import TracebackType
 
 from sl_bench.stage.grbl_motion import Braking, Ramp, Triple
-from sl_bench.stage.pty_port import PtyPort
+from sl_bench.stage.serial_emulator import SerialEmulator
 
+MICROSTEP_M = 0.047625e-6
 _COMMAND = re.compile(r"/(\d*) ?(\d?) ?(\d\d)? ?([a-z][^:]*)?(?::([0-9A-F]{2}))?")
 
 
@@ -49,7 +48,7 @@ class ZaberDevice:
 
     @property
     def busy(self) -> bool:
-        """It moves."""
+        """Whether it moves."""
         return self._ramp is not None
 
     @property
@@ -75,14 +74,32 @@ class ZaberDevice:
                 self.flags -= {"WR", "WH"}
 
     def go(self, target: float, now: float, *, homing: bool = False) -> None:
-        """Start a motion of the carriage."""
+        """Start a motion of the carriage.
+
+        Parameters
+        ----------
+        target : float
+            Where to, microsteps.
+        now : float
+            Time, seconds.
+        homing : bool
+            The axis knows its position afterwards.
+        """
         self._start, self._since, self._homing = self.carriage, now, homing
         self._direction = 1.0 if target >= self.carriage else -1.0
         self._ramp = Ramp(abs(target - self.carriage), self.speed, self.acceleration)
         self.flags.discard("NI")
 
     def stop(self, now: float, *, dead: bool = False) -> None:
-        """Decelerate, or stop dead."""
+        """Stop.
+
+        Parameters
+        ----------
+        now : float
+            Time, seconds.
+        dead : bool
+            At once; otherwise decelerate.
+        """
         self.advance(now)
         if self._ramp is None:
             return
@@ -92,13 +109,16 @@ class ZaberDevice:
         self._start, self._since = self.carriage, now
         self._ramp = None if dead or speed == 0.0 else Braking(speed, self.acceleration)
 
-    def fault(self, flag: str, now: float, *, stays: bool = False) -> None:
-        """Stop dead with a fault flag; ``stays`` keeps it whatever is cleared."""
-        self.stop(now, dead=True)
-        (self.stuck_flags if stays else self.flags).add(flag)
-
     def obey(self, data: str, now: float) -> tuple[bool, str]:
-        """Carry out a command; whether it is accepted, and the answer."""
+        """Carry out a command; whether it is accepted, and the answer.
+
+        Parameters
+        ----------
+        data : str
+            The command without address and number.
+        now : float
+            Time, seconds.
+        """
         self.advance(now)
         verb, _, rest = data.partition(" ")
         if verb == "get":
@@ -138,15 +158,13 @@ class ZaberDevice:
         return True, "0"
 
 
-class ZaberEmulator:
+class ZaberEmulator(SerialEmulator):
     """The chain on its cable; addresses 1, 2, 3 are x, y, z, or the axes of one controller.
 
     Parameters
     ----------
     travel_m : tuple of float
         Reach of the axes; the stage's zero is their middle.
-    microstep_m : float
-        Length of a microstep.
     homed : bool
         Start referenced.
     one_controller : bool
@@ -161,43 +179,20 @@ class ZaberEmulator:
         self,
         *,
         travel_m: Triple = (0.05, 0.05, 0.02),
-        microstep_m: float = 0.047625e-6,
         homed: bool = False,
         one_controller: bool = False,
         clock: Callable[[], float] = time.monotonic,
         seed: int = 0,
     ) -> None:
-        self._microstep_m, self._clock = microstep_m, clock
-        limits = [round(travel / microstep_m) for travel in travel_m]
+        super().__init__(seed)
+        self._clock = clock
+        limits = [round(travel / MICROSTEP_M) for travel in travel_m]
         self.devices = [
             ZaberDevice(*((1, i) if one_controller else (i, 1)), limit, limit // 2, homed)
             for i, limit in enumerate(limits, 1)
         ]
         self._lock = threading.Lock()
         self._pending = b""
-        self._lose = 0
-        self._port = PtyPort(self._exchange, seed)
-
-    def __enter__(self) -> ZaberEmulator:
-        self._port.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._port.close()
-
-    @property
-    def port(self) -> str:
-        """The terminal's path."""
-        return self._port.name
-
-    def link(self, path: str | Path) -> None:
-        """Keep a symbolic link to the terminal."""
-        self._port.link(path)
 
     def position_m(self) -> Triple:
         """Where the carriages stand now, stage metres; thread-safe."""
@@ -205,46 +200,41 @@ class ZaberEmulator:
             for device in self.devices:
                 device.advance(self._clock())
             x, y, z = (
-                (device.carriage - device.limit_max // 2) * self._microstep_m
-                for device in self.devices
+                (device.carriage - device.limit_max // 2) * MICROSTEP_M for device in self.devices
             )
         return x, y, z
 
     # -- faults on request ------------------------------------------------------------------------
 
-    def noise(self, count: int = 8) -> None:
-        """Random bytes in front of the next answer."""
-        self._port.noise(count)
-
-    def lose_replies(self, count: int = 1) -> None:
-        """The next so many replies never arrive."""
-        self._lose = count
-
     def fault(self, axis: int, flag: str = "FS", *, stays: bool = False) -> None:
-        """An axis (0 x, 1 y, 2 z) stops dead with a fault; the others go on."""
+        """Stop an axis dead with a fault; the others go on.
+
+        Parameters
+        ----------
+        axis : {0, 1, 2}
+            x, y, z.
+        flag : str
+            Two letters, as in replies.
+        stays : bool
+            The flag comes back however often it is cleared, until `release`.
+        """
         with self._lock:
-            self.devices[axis].fault(flag, self._clock(), stays=stays)
+            device = self.devices[axis]
+            device.stop(self._clock(), dead=True)
+            (device.stuck_flags if stays else device.flags).add(flag)
 
     def release(self) -> None:
-        """The causes of lasting faults are gone."""
+        """Remove the causes of lasting faults."""
         with self._lock:
             for device in self.devices:
                 device.stuck_flags.clear()
 
     def power_cycle(self) -> None:
-        """All devices forget where they are; no banner tells."""
+        """Let all devices forget where they are; no banner says so."""
         with self._lock:
             for device in self.devices:
                 device.stop(self._clock(), dead=True)
                 device.flags, device.offset = {"WR"}, device.carriage
-
-    def disconnect(self) -> None:
-        """Pull the cable."""
-        self._port.unplug()
-
-    def reconnect(self) -> None:
-        """Plug the cable in again."""
-        self._port.plug()
 
     # -- the wire -----------------------------------------------------------------------------
 
@@ -281,7 +271,6 @@ class ZaberEmulator:
         words = [f"{device.address:02d}", str(axis), *([number] if number else [])]
         words += ["OK" if accepted else "RJ", "BUSY" if device.busy else "IDLE", device.flag()]
         text = " ".join([*words, answer])
-        if self._lose:
-            self._lose -= 1
+        if self._loses_reply():
             return b""
         return f"@{text}{f':{-sum(text.encode()) & 0xFF:02X}' if lrc else ''}\r\n".encode()

@@ -1,6 +1,6 @@
-"""A pseudo-terminal that stands in for a serial cable: unplug it, plug it in, make it noisy.
+"""A device behind a pseudo-terminal that stands in for a serial cable.
 
-Knows no protocol. The emulators of serial devices share it.
+Knows no protocol: what the GRBL and the Zaber emulator share, with the faults of cable and port.
 """
 
 from __future__ import annotations
@@ -13,60 +13,70 @@ import termios
 import threading
 import time
 import tty
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from pathlib import Path
+from typing import Self
 
 TICK_S = 0.002
 
 
-class PtyPort:
-    """Runs a device behind a pseudo-terminal, in its own thread.
+class SerialEmulator(ABC):
+    """Runs a device behind a pseudo-terminal, in a thread of its own; a context manager.
 
     Parameters
     ----------
-    exchange : callable
-        ``exchange(received) -> to_send``, both bytes; called at least every 2 ms and whenever
-        bytes arrive. It is the device.
     seed : int
-        Of the noise.
+        Of the noise on the line.
     """
 
-    def __init__(self, exchange: Callable[[bytes], bytes], seed: int = 0) -> None:
-        self._exchange = exchange
+    def __init__(self, seed: int = 0) -> None:
         self._random = random.Random(seed)
-        self._lock = threading.Lock()
+        self._cable = threading.Lock()
         self._master = self._slave = -1
         self._links: list[Path] = []
-        self._noise_bytes = 0
+        self._noise_bytes = self._replies_to_lose = 0
         self._running = False
-        self._thread = threading.Thread(target=self._loop, name="pty device", daemon=True)
+        self._thread = threading.Thread(target=self._loop, name="serial device", daemon=True)
 
-    @property
-    def name(self) -> str:
-        """Path of the terminal that a driver opens; changes when the cable is plugged anew."""
-        return os.ttyname(self._slave)
+    @abstractmethod
+    def _exchange(self, received: bytes) -> bytes:
+        """Take what the host sent, return what it is sent; called at least every 2 ms."""
 
-    def start(self) -> None:
-        """Plug in and run."""
-        self.plug()
+    def start(self) -> Self:
+        """Plug in and run; from now on ``port`` can be opened."""
+        self.reconnect()
         self._running = True
         self._thread.start()
+        return self
 
     def close(self) -> None:
-        """Stop the device and take the links away."""
+        """Stop the device and remove the links."""
         self._running = False
         if self._thread.is_alive():
             self._thread.join()
-        self.unplug()
+        self.disconnect()
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def port(self) -> str:
+        """Path of the terminal that a driver opens; changes when the cable is plugged in again."""
+        return os.ttyname(self._slave)
 
     def link(self, path: str | Path) -> None:
         """Keep a symbolic link to the terminal: a name that outlives unplugging."""
         self._links.append(Path(path))
         self._relink()
 
-    def plug(self) -> None:
-        """Connect the cable: a new terminal, and the links lead to it."""
-        with self._lock:
+    # -- faults on request --------------------------------------------------------------------
+
+    def reconnect(self) -> None:
+        """Plug in the cable: a new terminal, and the links lead to it."""
+        with self._cable:
             if self._master >= 0:
                 return
             self._master, self._slave = os.openpty()
@@ -74,9 +84,9 @@ class PtyPort:
             os.set_blocking(self._master, False)
         self._relink()
 
-    def unplug(self) -> None:
+    def disconnect(self) -> None:
         """Pull the cable: whoever has the port open gets an error, the links are gone."""
-        with self._lock:
+        with self._cable:
             if self._master < 0:
                 return
             for link in self._links:
@@ -85,9 +95,21 @@ class PtyPort:
             os.close(self._slave)
             self._master = self._slave = -1
 
-    def noise(self, count: int) -> None:
-        """Put so many random bytes in front of the device's next answer."""
+    def noise(self, count: int = 8) -> None:
+        """Put ``count`` random bytes in front of the next answer."""
         self._noise_bytes += count
+
+    def lose_replies(self, count: int = 1) -> None:
+        """Lose the next ``count`` replies."""
+        self._replies_to_lose = count
+
+    def _loses_reply(self) -> bool:
+        """Whether this reply gets lost."""
+        lost = self._replies_to_lose > 0
+        self._replies_to_lose -= lost
+        return lost
+
+    # -- the cable ----------------------------------------------------------------------------
 
     def _relink(self) -> None:
         if self._slave < 0:
@@ -95,7 +117,7 @@ class PtyPort:
         for link in self._links:
             beside = link.with_name(link.name + ".new")
             beside.unlink(missing_ok=True)
-            beside.symlink_to(self.name)
+            beside.symlink_to(self.port)
             beside.replace(link)
 
     def _loop(self) -> None:
@@ -103,10 +125,10 @@ class PtyPort:
             self._send(self._exchange(self._receive()))
 
     def _receive(self) -> bytes:
-        with self._lock:
+        with self._cable:
             master = self._master
             if master >= 0:
-                # the lock keeps the descriptor ours: a closed one may be somebody else's by now
+                # The lock keeps the descriptor ours: a closed one may belong to another by now.
                 ready, _, _ = select.select([master], [], [], TICK_S)
                 if not ready:
                     return b""
@@ -119,9 +141,9 @@ class PtyPort:
         if not data:
             return
         if self._noise_bytes:
-            # no line ends and no ASCII: noise, not another answer
+            # No line ends and no ASCII: noise, not another answer.
             noise = bytes(self._random.randrange(0x80, 0x100) for _ in range(self._noise_bytes))
             data, self._noise_bytes = noise + data, 0
-        with self._lock, contextlib.suppress(OSError):
+        with self._cable, contextlib.suppress(OSError):
             if self._master >= 0:
                 os.write(self._master, data)
