@@ -18,9 +18,10 @@ from sl_bench.world.reference_rig import reference_rig
 from sl_bench.world.surfaces import make_surface
 from sl_bench.world.world import World
 from sl_bringup.bag.bag_writer import new_bag
-from sl_bringup.bag.bags import TOPICS, open_bag, typestore
+from sl_bringup.bag.bags import open_bag, typestore
 from sl_bringup.bag.mcap_writer import McapWriter
 from sl_bringup.evaluation.evaluation import Choices, Crew, evaluate_bag
+from sl_common.topics import EVALUATED_TOPICS
 from sl_projector.sequence.pattern_sequence import named
 from sl_reconstruct.model.calibration_file import Calibration
 
@@ -51,7 +52,7 @@ def compress(source: Path, target: Path) -> None:
     """Write the same messages as `slrig record` does when it compresses."""
     with open_bag(source) as bag:
         writer, channels = McapWriter(target, True, {}), {}
-        for raw in bag.raw(*TOPICS):
+        for raw in bag.raw(*EVALUATED_TOPICS):
             kind = raw.topic.msgtype
             if raw.topic not in channels:
                 definition, _ = typestore().generate_msgdef(kind, ros_version=2)

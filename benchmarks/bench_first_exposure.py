@@ -28,18 +28,17 @@ class Caller:
     def __init__(self, sequence: str) -> None:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
-        from sl_interfaces.msg import PatternTrigger
-        from sl_interfaces.srv import Project, Scan
 
-        from sl_common.base_node import EVENTS
+        from sl_common import topics
+        from sl_common.base_node import GraphNode
 
         rclpy.init()
         self._sequence = sequence
-        self._node = rclpy.create_node("first_exposure", namespace="sl")
-        self._scan = self._node.create_client(Scan, "scan")
-        self._project = self._node.create_client(Project, "projector/project")
+        self._node = GraphNode("first_exposure", namespace=topics.NAMESPACE)
+        self._scan = self._node.client(topics.SCAN)
+        self._project = self._node.client(topics.PROJECT)
         self._first_ns: list[int] = []
-        self._node.create_subscription(PatternTrigger, "projector/trigger", self._hear, EVENTS)
+        self._node.listen(topics.TRIGGER, self._hear)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
         self._thread = threading.Thread(target=self._executor.spin, daemon=True)

@@ -191,31 +191,22 @@ class Client:
 
     def __init__(self) -> None:
         import rclpy
-        from diagnostic_msgs.msg import DiagnosticArray
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
-        from sensor_msgs.msg import PointCloud2
-        from sl_interfaces.msg import PatternTrigger
-        from sl_interfaces.srv import MoveStage, Scan
-        from std_srvs.srv import Trigger
 
-        from sl_common.base_node import EVENTS, LARGE
+        from sl_common import topics
+        from sl_common.base_node import GraphNode
 
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node("soak", namespace="sl")
-        self._kinds = {"scan": Scan, "stage/move": MoveStage}
-        names = ("scan", "stage/move", "stage/home", "stage/clear", "stage/stop")
-        self._clients = {
-            name: self._node.create_client(self._kinds.get(name, Trigger), name) for name in names
-        }
+        self._node = GraphNode("soak", namespace=topics.NAMESPACE)
+        stage = (topics.MOVE_STAGE, topics.HOME_STAGE, topics.CLEAR_STAGE, topics.STOP_STAGE)
+        self._clients = {s.name: self._node.client(s) for s in (topics.SCAN, *stage)}
         self.clouds: list[tuple[int, Any]] = []  # with the start of their first exposure, ns
         self.health: dict[str, tuple[float, int, str]] = {}
         self.exposing = threading.Event()
-        self._node.create_subscription(
-            PatternTrigger, "projector/trigger", lambda _: self.exposing.set(), EVENTS
-        )
-        self._node.create_subscription(PointCloud2, "reconstruct/points", self._on_cloud, LARGE)
-        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_health, 50)
+        self._node.listen(topics.TRIGGER, lambda _: self.exposing.set())
+        self._node.listen(topics.POINTS, self._on_cloud)
+        self._node.listen(topics.DIAGNOSTICS, self._on_health)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
         self._thread = threading.Thread(target=self._spin, daemon=True)

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from sl_bringup.bag.bags import IMAGE, open_bag
+from sl_bringup.bag.bags import open_bag
+from sl_common.topics import IMAGE
 from support.bag_damage import CHECKED, KINDS, SCANS, Found, damage, look, make
 
 #: The worst 1 % of the points left out; whole bags have 1.35 um, an exchanged image a thousand.

@@ -20,10 +20,6 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from sl_bench.world.reference_rig import reference_rig
 from sl_bringup.bag.bag_writer import BagWriter, Storage, header, new_bag
 from sl_bringup.bag.bags import (
-    CALIBRATION,
-    IMAGE,
-    POSE,
-    TRIGGER,
     interface_dir,
     message_class,
     natural_key,
@@ -32,6 +28,7 @@ from sl_bringup.bag.bags import (
     typestore,
 )
 from sl_common.errors import BagError
+from sl_common.topics import CALIBRATION, IMAGE, POSE, TRIGGER
 from sl_projector.sequence.pattern_sequence import named
 from sl_reconstruct.model.calibration_file import Calibration, parse_calibration, rig_hash
 from support.paths import DATA

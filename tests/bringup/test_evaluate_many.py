@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from sl_bringup.bag.bag_writer import BagWriter, new_bag
-from sl_bringup.bag.bags import REPORT, SETTINGS, message_class
+from sl_bringup.bag.bags import message_class
 from sl_bringup.cli.main import main
 from sl_bringup.evaluation.sweep import variants
 from sl_common.errors import ConfigError
+from sl_common.topics import REPORT, SETTINGS
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.model.calibration_file import Calibration, save_calibration
 from sl_reconstruct.model.rig import Rig

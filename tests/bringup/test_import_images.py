@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from sl_bringup.bag.bags import CALIBRATION, IMAGE, POSE, TRIGGER, open_bag
+from sl_bringup.bag.bags import open_bag
 from sl_bringup.cli.import_images import import_folder, scan_folders
 from sl_bringup.cli.main import main
 from sl_camera.sync.message_fields import stamp_ns
 from sl_common.errors import BagError, StackError
+from sl_common.topics import CALIBRATION, IMAGE, POSE, TRIGGER
 from sl_projector.sequence.pattern_sequence import named
 from sl_projector.sequence.sequence_file import SequenceFile, load_sequence_file
 from sl_reconstruct.model.calibration_file import rig_hash, save_calibration

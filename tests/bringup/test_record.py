@@ -17,20 +17,12 @@ from rosbags.highlevel import AnyReader
 
 from sl_bringup.bag.bag_recorder import BagRecorder
 from sl_bringup.bag.bag_writer import header, topic_qos
-from sl_bringup.bag.bags import (
-    CALIBRATION,
-    IMAGE,
-    POSE,
-    SETTINGS,
-    TRIGGER,
-    message_class,
-    open_bag,
-    typestore,
-)
+from sl_bringup.bag.bags import message_class, open_bag, typestore
 from sl_bringup.cli.main import main
 from sl_bringup.cli.record import size_bytes
 from sl_bringup.graph.console import StatusLine
 from sl_common.errors import BagError, ConfigError
+from sl_common.topics import CALIBRATION, IMAGE, POSE, SETTINGS, TRIGGER
 from sl_projector.sequence.pattern_sequence import named
 
 START_NS = 1_700_000_000_000_000_000
@@ -253,7 +245,7 @@ from pathlib import Path
 sys.path[:0] = {path!r}
 from sl_bringup.bag.bag_recorder import BagRecorder
 from sl_bringup.bag.bag_writer import BagWriter, topic_qos
-from sl_bringup.bag.bags import POSE, IMAGE
+from sl_common.topics import POSE, IMAGE
 from test_record import image_cdr
 with BagRecorder(Path({bag!r})) as bag:
     for topic in (POSE, IMAGE):

@@ -11,9 +11,10 @@ import pytest
 from test_evaluate_many import START_NS, evaluate, live_report, summary, write_scans
 
 from sl_bringup.bag.bag_writer import BagWriter, new_bag
-from sl_bringup.bag.bags import CAMERA_SETTINGS, MATCHING, REPORT, SETTINGS, Topic, message_class
+from sl_bringup.bag.bags import message_class
 from sl_camera.sync.matching import MatcherSettings
 from sl_common.errors import ConfigError
+from sl_common.topics import CAMERA_SETTINGS, MATCHING, REPORT, SETTINGS, Topic
 from sl_reconstruct.decode import full_scale
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.model.calibration_file import Calibration

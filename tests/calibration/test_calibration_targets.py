@@ -13,7 +13,7 @@ import pytest
 import sl_calibration.workflow.conclude
 from sl_bench.world.mounting import Mounting
 from sl_bringup.bag.bag_writer import new_bag
-from sl_bringup.bag.bags import CALIBRATION_RUN, message_class
+from sl_bringup.bag.bags import message_class
 from sl_bringup.cli.main import main
 from sl_bringup.evaluation import calibrate_bag
 from sl_bringup.evaluation.calibrate_bag import solve_recorded
@@ -23,6 +23,7 @@ from sl_calibration.solve.bundle_adjustment import lens_values
 from sl_calibration.solve.fixed_intrinsics import keep_of
 from sl_calibration.verify.verification import triangulate
 from sl_common.errors import CalibrationError
+from sl_common.topics import CALIBRATION_RUN
 from sl_projector.sequence.pattern_sequence import named
 from sl_reconstruct.model.calibration_file import Calibration, Covariance
 from sl_reconstruct.model.rig import BrownConrady, Device, Rig

@@ -19,15 +19,13 @@ from support.paths import SOURCES
 ros_graph.require_ros()
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
-from rclpy.action import ActionClient  # noqa: E402
 from sl_interfaces.action import Calibrate as CalibrateAction  # noqa: E402
-from sl_interfaces.msg import RigCalibration  # noqa: E402
 from sl_interfaces.srv import Calibrate, Verify  # noqa: E402
 
 from sl_bench.process.bench_control import BenchControl  # noqa: E402
 from sl_bringup.graph.transport import Transport, process_environment  # noqa: E402
 from sl_calibration.verify.verification import triangulate  # noqa: E402
-from sl_common.base_node import LATCHED  # noqa: E402
+from sl_common import topics  # noqa: E402
 from sl_reconstruct.model.calibration_file import load_rig, parse_calibration, rig_hash  # noqa: E402
 from support.ros_graph import Graph, wait  # noqa: E402
 
@@ -55,9 +53,7 @@ class Running:
 
     def calibrate(self, **request: object) -> Calibrate.Response:
         # The first call may wait for the compiler.
-        return self.graph.call(
-            Calibrate, "calibration/calibrate", Calibrate.Request(**request), 250
-        )
+        return self.graph.call(topics.CALIBRATE, Calibrate.Request(**request), 250)
 
     def height_m(self) -> float:
         with BenchControl(self.directory) as bench:
@@ -90,7 +86,7 @@ def start(directory: Path, domain: int) -> dict[str, subprocess.Popen[bytes]]:
 def await_devices(graph: Graph) -> None:
     """Wait until every node has said of itself that it is well."""
     said: list[DiagnosticArray] = []
-    graph.tester.create_subscription(DiagnosticArray, "/diagnostics", said.append, 50)
+    graph.tester.listen(topics.DIAGNOSTICS, said.append)
 
     def ready() -> bool:
         levels = {s.name.partition(":")[0]: s.level for array in said for s in array.status}
@@ -129,8 +125,7 @@ def test_refusals_come_before_anything_moves(running: Running) -> None:
     assert "does not reach" in running.calibrate(heights_m=[0.0, 1e-3, 0.5]).message
     assert "1 different heights" in running.calibrate(heights_m=[0.0]).message
     assert "positive number" in running.calibrate(plate_pitch_m=-1.0).message
-    assert "nothing to verify" in running.graph.call(
-        Verify, "calibration/verify", Verify.Request()
+    assert "nothing to verify" in running.graph.call(topics.VERIFY, Verify.Request()
     ).message  # fmt: skip
     assert running.height_m() == before_m
     assert not (running.store / "current").exists()
@@ -163,7 +158,7 @@ def test_one_call_calibrates_the_rig(running: Running, calibrated: Calibrate.Res
 
 
 def test_it_is_in_force_and_stored(running: Running, calibrated: Calibrate.Response) -> None:
-    rigs = running.graph.collect(RigCalibration, "calibration/rig", LATCHED)
+    rigs = running.graph.collect(topics.CALIBRATION)
     message = wait(lambda: rigs and rigs[-1], "the latched calibration")
     assert message.hash == calibrated.hash
     assert rig_hash(parse_calibration(message.yaml).rig) == calibrated.hash
@@ -174,7 +169,7 @@ def test_it_is_in_force_and_stored(running: Running, calibrated: Calibrate.Respo
 
 
 def test_verify_finds_a_good_rig_good(running: Running, calibrated: Calibrate.Response) -> None:
-    answer = running.graph.call(Verify, "calibration/verify", Verify.Request(), 150.0)
+    answer = running.graph.call(topics.VERIFY, Verify.Request(), 150.0)
     assert answer.success, answer.message
     assert not answer.recalibrate
     assert answer.rms_m < 1e-6
@@ -200,7 +195,7 @@ def test_a_dark_lamp_is_refused_and_the_old_calibration_stays(
 
 def test_a_run_can_be_cancelled_half_way(running: Running, calibrated: Calibrate.Response) -> None:
     told: list[CalibrateAction.Feedback] = []
-    client = ActionClient(running.graph.tester, CalibrateAction, "calibration/calibrate")
+    client = running.graph.tester.action_client(topics.CALIBRATE_ACTION)
     assert client.wait_for_server(ros_graph.PATIENCE_S)
     goal = CalibrateAction.Goal(heights_m=HEIGHTS_M)
     sent = client.send_goal_async(goal, lambda m: told.append(m.feedback))

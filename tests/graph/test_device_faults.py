@@ -21,6 +21,7 @@ ros_graph.require_ros()
 from sl_interfaces.msg import MatchedFrame  # noqa: E402
 
 from sl_bench.camera.camera_faults import CameraFaults  # noqa: E402
+from sl_common import topics  # noqa: E402
 from support import fault_cell  # noqa: E402
 from support.fault_cell import Cell  # noqa: E402
 from support.ros_graph import wait  # noqa: E402
@@ -163,8 +164,8 @@ def zaber_cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
 
 
 def home(cell: Cell) -> None:
-    cell.call("stage/clear")
-    answer = cell.call("stage/home")
+    cell.call(topics.CLEAR_STAGE)
+    answer = cell.call(topics.HOME_STAGE)
     assert answer.success, answer.message
 
 
@@ -195,9 +196,9 @@ GRBL_IN_MOTION = [
 ZABER = [
     ("reply lost", lambda c: c.stage.lose_replies(20), "does not answer",
      lambda c: c.stage.lose_replies(0)),
-    ("fault", lambda c: c.stage.fault(0), "stalled", lambda c: c.call("stage/clear")),
+    ("fault", lambda c: c.stage.fault(0), "stalled", lambda c: c.call(topics.CLEAR_STAGE)),
     ("emergency stop", lambda c: c.stage.fault(0, "FH", stays=True), "emergency stop",
-     lambda c: (c.stage.release(), c.call("stage/clear"))),
+     lambda c: (c.stage.release(), c.call(topics.CLEAR_STAGE))),
     ("power cycle", lambda c: c.stage.power_cycle(), "no reference", home),
     ("unplugged", unplug, "gone|cannot open", lambda c: c.stage.reconnect()),
 ]  # fmt: skip

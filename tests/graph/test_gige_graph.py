@@ -11,7 +11,6 @@ from support import ros_graph
 
 ros_graph.require_ros()
 
-from sensor_msgs.msg import Image  # noqa: E402
 from sl_interfaces.msg import PatternTrigger  # noqa: E402
 
 from sl_bench.process.bench import Bench  # noqa: E402
@@ -30,7 +29,7 @@ from sl_camera.sync.matching import (  # noqa: E402
     Status,
     TriggerEvent,
 )
-from sl_common.base_node import EVENTS, IMAGES  # noqa: E402
+from sl_common import topics  # noqa: E402
 from sl_projector.dlpc.dlpc900_driver import Dlpc900  # noqa: E402
 from sl_projector.dlpc.dmd import Timing  # noqa: E402
 from sl_projector.sequence.messages import stamp_from_msg, stamp_to_msg  # noqa: E402
@@ -49,9 +48,9 @@ def test_two_hundred_software_triggered_frames_through_the_node_without_loss() -
             CameraNode, address="aravis:127.0.0.1", trigger="software", exposure_s=0.003,
             region=[0, 0, 64, 48], settle_s=0.0,
         )  # fmt: skip
-        images = graph.collect(Image, "camera/image_raw", IMAGES)
+        images = graph.collect(topics.IMAGE)
         wait(lambda: node.health().level == "ok", "the camera")
-        triggers = graph.publisher(PatternTrigger, "projector/trigger", EVENTS)
+        triggers = graph.publisher(topics.TRIGGER)
         stamps = []
         for i in range(200):
             message = PatternTrigger(exposure_s=5.0)
@@ -70,7 +69,7 @@ def test_packet_loss_and_an_unplugged_cable_are_told_and_over_when_they_are_over
     mirrors = np.ones((2, 2), np.bool_)
     with gige_bench() as (emulator, gige), ros_graph.graph() as graph:
         node = graph.add(CameraNode, address="aravis:127.0.0.1", exposure_s=0.003)
-        images = graph.collect(Image, "camera/image_raw", IMAGES)
+        images = graph.collect(topics.IMAGE)
         wait(lambda: node.health().level == "ok", "the camera")
 
         def edges(count: int) -> None:

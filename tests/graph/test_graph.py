@@ -18,12 +18,11 @@ from support.paths import SOURCES
 ros_graph.require_ros()
 
 from geometry_msgs.msg import Point  # noqa: E402
-from sensor_msgs.msg import PointCloud2  # noqa: E402
 from sl_interfaces.srv import MoveStage, Project, Scan  # noqa: E402
 
 from sl_bench.world.reference_rig import reference_rig  # noqa: E402
 from sl_bringup.graph.transport import Transport, process_environment  # noqa: E402
-from sl_common.base_node import LARGE  # noqa: E402
+from sl_common import topics  # noqa: E402
 from sl_reconstruct.cloud.cloud_writer import cloud_hash  # noqa: E402
 from sl_reconstruct.messages import cloud_from_msg  # noqa: E402
 from sl_reconstruct.model.calibration_file import rig_hash, save_calibration  # noqa: E402
@@ -94,12 +93,12 @@ def running(tmp_path: Path) -> Iterator[Running]:
 
 def test_one_scan_from_trigger_to_cloud_and_a_clean_end(running: Running) -> None:
     graph = running.graph
-    clouds = graph.collect(PointCloud2, "reconstruct/points", LARGE)
+    clouds = graph.collect(topics.POINTS)
     height = MoveStage.Request(target=Point(z=HEIGHT_M))
-    moved = graph.call(MoveStage, "stage/move", height, 60.0)
+    moved = graph.call(topics.MOVE_STAGE, height, 60.0)
     assert moved.success, moved.message
     # The first scan may wait for the compiler.
-    answer = graph.call(Scan, "scan", Scan.Request(max_repeats=3), 250.0)
+    answer = graph.call(topics.SCAN, Scan.Request(max_repeats=3), 250.0)
     assert answer.success, answer.message
     points = cloud_from_msg(wait(lambda: clouds and clouds[-1], "the cloud"))
     report = answer.report
@@ -112,7 +111,7 @@ def test_one_scan_from_trigger_to_cloud_and_a_clean_end(running: Running) -> Non
     # A flat plate, lifted by the stage, which counts in steps of 4 um (250 per mm). Issue 2 asks
     # for 0.2 um of noise, so the median of a million points has no room for more than a step.
     assert abs(np.median(points["z"][there]) - HEIGHT_M) < 4e-6
-    again = graph.call(Project, "projector/project", Project.Request(sequence="paper"), 60.0)
+    again = graph.call(topics.PROJECT, Project.Request(sequence="paper"), 60.0)
     assert again.success
     wait(lambda: len(clouds) == 2, "the cloud of a projection that nobody called a scan", 60.0)
     assert running.stop() == dict.fromkeys([*NODES, "bench"], 0)

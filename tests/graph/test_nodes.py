@@ -21,11 +21,10 @@ ros_graph.require_ros()
 
 from geometry_msgs.msg import Point, PoseStamped  # noqa: E402
 from rcl_interfaces.srv import SetParameters  # noqa: E402
-from rclpy.action import ActionClient  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
+from sensor_msgs.msg import Image, PointCloud2  # noqa: E402
 from sl_interfaces.action import Scan as ScanAction  # noqa: E402
-from sl_interfaces.msg import MatchedFrame, PatternStack, PatternTrigger, RigCalibration, ScanReport  # noqa: E402
+from sl_interfaces.msg import MatchedFrame, PatternStack, PatternTrigger, RigCalibration  # noqa: E402
 from sl_interfaces.msg import Pattern as PatternMsg  # noqa: E402
 from sl_interfaces.srv import Measure, MoveStage, Project, Scan  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
@@ -38,7 +37,7 @@ from sl_camera.messages import image_to_msg, pose_to_msg, stack_to_msg  # noqa: 
 from sl_camera.stage_node import StageNode  # noqa: E402
 from sl_camera.sync.match_events import MatchedStack, PoseEvent  # noqa: E402
 from sl_camera.synchronizer_node import SynchronizerNode  # noqa: E402
-from sl_common.base_node import EVENTS, IMAGES, LARGE, LATCHED  # noqa: E402
+from sl_common import topics  # noqa: E402
 from sl_common.errors import ConfigError, DeviceError, DeviceLost, StackError  # noqa: E402
 from sl_projector.projector_node import ProjectorNode  # noqa: E402
 from sl_projector.sequence.messages import stamp_from_msg, stamp_to_msg, trigger_to_msg  # noqa: E402
@@ -60,6 +59,10 @@ HEIGHT, WIDTH = 12, 16
 PLANE_TOLERANCE_M = 2e-6
 
 
+def set_parameters(node: str) -> topics.Service:
+    return topics.Service(f"{node}/set_parameters", "rcl_interfaces/srv/SetParameters")
+
+
 @cache
 def frames(name: str) -> np.ndarray:
     return render(tiny_sequence(name))
@@ -73,11 +76,11 @@ class Feed:
 
     def __init__(self, graph: Graph) -> None:
         self.node = graph.add(SynchronizerNode, timeout_s=0.4, early_image_s=0.4)
-        self.triggers = graph.publisher(PatternTrigger, "projector/trigger", EVENTS)
-        self.images = graph.publisher(Image, "camera/image_raw", IMAGES)
-        self.poses = graph.publisher(PoseStamped, "stage/pose", EVENTS)
-        self.frames = graph.collect(MatchedFrame, "synchronizer/frame", EVENTS)
-        self.stacks = graph.collect(PatternStack, "synchronizer/stack", LARGE)
+        self.triggers = graph.publisher(topics.TRIGGER)
+        self.images = graph.publisher(topics.IMAGE)
+        self.poses = graph.publisher(topics.POSE)
+        self.frames = graph.collect(topics.FRAME)
+        self.stacks = graph.collect(topics.STACK)
         self.scan_id = 0
         self.clock_ns = time.time_ns()
         self.rng = np.random.default_rng(5)
@@ -220,10 +223,10 @@ class Works:
     def __init__(self, graph: Graph, calibration: Path) -> None:
         self.graph = graph
         self.node = graph.add(ReconstructNode, calibration_file=str(calibration))
-        self.stacks = graph.publisher(PatternStack, "synchronizer/stack", LARGE)
-        self.clouds = graph.collect(PointCloud2, "reconstruct/points", LARGE)
-        self.refusals = graph.collect(Image, "reconstruct/refusals", LARGE)
-        self.reports = graph.collect(ScanReport, "reconstruct/report", EVENTS)
+        self.stacks = graph.publisher(topics.STACK)
+        self.clouds = graph.collect(topics.POINTS)
+        self.refusals = graph.collect(topics.REFUSALS)
+        self.reports = graph.collect(topics.REPORT)
         wait(lambda: self.node.health().level == "ok", "the kernels", 200.0)
 
     def refused(self) -> int:
@@ -294,7 +297,7 @@ def test_every_position_without_a_point_has_its_reason(works: Works) -> None:
 
 def test_the_last_cloud_can_be_measured(works: Works) -> None:
     works.expect_plane()
-    answer = works.graph.call(Measure, "measure", Measure.Request(kind="plane"))
+    answer = works.graph.call(topics.MEASURE, Measure.Request(kind="plane"))
     assert answer.success, answer.message
     slope = dict(zip(answer.names, answer.values, strict=True))["a"]
     # Over 5 mm and more a tilt shifts the border by the plane's tolerance.
@@ -331,7 +334,7 @@ def set_calibration(works: Works, path: Path) -> tuple[bool, str]:
     request = SetParameters.Request(
         parameters=[Parameter("calibration_file", value=str(path)).to_parameter_msg()]
     )
-    answer = works.graph.call(SetParameters, "reconstruct/set_parameters", request)
+    answer = works.graph.call(set_parameters("reconstruct"), request)
     return answer.results[0].successful, answer.results[0].reason
 
 
@@ -350,7 +353,7 @@ def test_a_calibration_cut_in_half_is_refused_and_the_old_one_stays(
 
 
 def test_the_calibration_in_force_is_latched_for_who_comes_late(works: Works) -> None:
-    found = works.graph.collect(RigCalibration, "calibration/rig", LATCHED)
+    found = works.graph.collect(topics.CALIBRATION)
     message = wait(lambda: found and found[0], "the latched calibration")
     assert message.hash == rig_hash(tiny_rig())
     assert (message.camera.width, message.camera.height) == (320, 120)
@@ -359,7 +362,7 @@ def test_the_calibration_in_force_is_latched_for_who_comes_late(works: Works) ->
 
 
 def test_a_false_calibration_message_changes_nothing(works: Works) -> None:
-    rigs = works.graph.publisher(RigCalibration, "calibration/rig", LATCHED)
+    rigs = works.graph.publisher(topics.CALIBRATION)
     for yaml in ("", "format: 1\ncamera: [", dump_calibration(tiny_rig())):
         before = works.refused()
         message = RigCalibration(hash="0" * 64, source="test", yaml=yaml)
@@ -375,8 +378,8 @@ def test_without_a_calibration_a_node_says_so_until_its_file_is_there(tmp_path: 
     path.write_text(dump_calibration(tiny_rig())[:500])
     with ros_graph.graph() as graph:
         node = graph.add(ReconstructNode, calibration_file=str(path))
-        stacks = graph.publisher(PatternStack, "synchronizer/stack", LARGE)
-        clouds = graph.collect(PointCloud2, "reconstruct/points", LARGE)
+        stacks = graph.publisher(topics.STACK)
+        clouds = graph.collect(topics.POINTS)
         stacks.publish(stack_message())
         wait(lambda: node.counts["synchronizer/stack refused"], "a refusal", 60.0)
         assert node.health().level == "error"
@@ -392,7 +395,7 @@ def test_without_a_calibration_a_node_says_so_until_its_file_is_there(tmp_path: 
 
 def project(graph: Graph, name: str = "paper", exposure_s: float = 0.004) -> Project.Response:
     request = Project.Request(sequence=name, exposure_s=exposure_s)
-    return graph.call(Project, "projector/project", request)
+    return graph.call(topics.PROJECT, request)
 
 
 def test_each_trigger_is_published_at_its_exposure_and_not_before(tmp_path: Path) -> None:
@@ -406,12 +409,9 @@ def test_each_trigger_is_published_at_its_exposure_and_not_before(tmp_path: Path
     with ros_graph.graph() as graph:
         driver = FakeProjector()
         graph.add(tiny_projector, lambda: driver, sequence_dir=str(tmp_path / "inside"))
-        graph.tester.create_subscription(
-            PatternTrigger, "projector/trigger", lambda m: arrived.append((time.time_ns(), m)),
-            EVENTS,
-        )  # fmt: skip
+        graph.tester.listen(topics.TRIGGER, lambda m: arrived.append((time.time_ns(), m)))
         wait(lambda: driver.opened, "the projector")
-        wait(lambda: graph.tester.count_publishers("projector/trigger"), "its triggers")
+        wait(lambda: graph.tester.count_publishers(topics.TRIGGER.name), "its triggers")
         assert project(graph, "mine").success
         answer = project(graph, "paper", 0.02)
         assert answer.success
@@ -485,12 +485,12 @@ def test_a_busy_projector_refuses_and_stop_ends_what_it_shows() -> None:
         graph.add(tiny_projector, lambda: driver)
         wait(lambda: driver.opened, "the projector")
         request = Project.Request(sequence="paper", exposure_s=5.0)
-        first = graph.call_async(Project, "projector/project", request)
+        first = graph.call_async(topics.PROJECT, request)
         wait(lambda: driver._info, "the first projection")
         busy = project(graph)
         assert not busy.success
         assert "busy" in busy.message
-        assert graph.call(Trigger, "projector/stop", Trigger.Request()).success
+        assert graph.call(topics.STOP_PROJECTOR, Trigger.Request()).success
         wait(first.done, "the first projection's end")
         assert not first.result().success
         assert project(graph).success
@@ -508,8 +508,8 @@ def test_the_camera_publishes_whole_frames_with_their_info_and_comes_back() -> N
         driver = FakeCamera()
         driver.gone = True
         node = graph.add(CameraNode, lambda: driver)
-        images = graph.collect(Image, "camera/image_raw", IMAGES)
-        infos = graph.collect(CameraInfo, "camera/camera_info", IMAGES)
+        images = graph.collect(topics.IMAGE)
+        infos = graph.collect(topics.CAMERA_INFO)
         driver.gone = False
         wait(lambda: driver.armed == 1, "the camera")
         driver.frames.put(Frame(pixels, 1, 10**18, 0.01, FrameStatus.INCOMPLETE))
@@ -537,7 +537,7 @@ def test_exposure_is_a_parameter_and_what_the_camera_cannot_is_refused() -> None
         def set_exposure(value: float) -> tuple[bool, str]:
             parameter = Parameter("exposure_s", value=value).to_parameter_msg()
             request = SetParameters.Request(parameters=[parameter])
-            result = graph.call(SetParameters, "camera/set_parameters", request).results[0]
+            result = graph.call(set_parameters("camera"), request).results[0]
             return result.successful, result.reason
 
         assert set_exposure(0.02)[0]
@@ -558,9 +558,9 @@ def test_a_software_triggered_camera_follows_the_projector() -> None:
     with ros_graph.graph() as graph:
         driver = FakeCamera()
         node = graph.add(CameraNode, lambda: driver, trigger="software", exposure_s=0.01)
-        images = graph.collect(Image, "camera/image_raw", IMAGES)
+        images = graph.collect(topics.IMAGE)
         wait(lambda: driver.armed, "the camera")
-        triggers = graph.publisher(PatternTrigger, "projector/trigger", EVENTS)
+        triggers = graph.publisher(topics.TRIGGER)
 
         def show(pattern_s: float) -> int:
             message = PatternTrigger(exposure_s=pattern_s)
@@ -577,7 +577,7 @@ def test_a_software_triggered_camera_follows_the_projector() -> None:
         expose(first_ns + 300_000_000)
         wait(lambda: images, "the image")
         assert stamp_from_msg(images[0].header.stamp) == first_ns
-        assert graph.call(Trigger, "camera/trigger", Trigger.Request()).success
+        assert graph.call(topics.TRIGGER_CAMERA, Trigger.Request()).success
         assert driver.triggered == 2
 
         second_ns = show(5.0)
@@ -601,9 +601,9 @@ def test_another_makers_driver_serves_by_remapping_its_image() -> None:
         )  # fmt: skip
         publisher = driver.create_publisher(Image, "~/image_raw", 30)
         assert publisher.topic_name == "/sl/camera/image_raw"
-        stacks = graph.collect(PatternStack, "synchronizer/stack", LARGE)
-        verdicts = graph.collect(MatchedFrame, "synchronizer/frame", EVENTS)
-        triggers = graph.publisher(PatternTrigger, "projector/trigger", EVENTS)
+        stacks = graph.collect(topics.STACK)
+        verdicts = graph.collect(topics.FRAME)
+        triggers = graph.publisher(topics.TRIGGER)
         wait(publisher.get_subscription_count, "the synchroniser")
         pixels = np.random.default_rng(8).integers(0, 256, (len(SEQUENCE), 6, 7), np.uint8)
 
@@ -640,13 +640,13 @@ def test_the_stage_moves_within_its_limits_and_tells_where_it_is() -> None:
     with ros_graph.graph() as graph:
         driver = FakeStage()
         node = graph.add(StageNode, lambda: driver, home_at_start=True)
-        poses = graph.collect(PoseStamped, "stage/pose", EVENTS)
+        poses = graph.collect(topics.POSE)
         wait(lambda: poses, "a pose")
         assert driver.homed == 1
 
         def move(x_m: float, relative: bool = False) -> MoveStage.Response:
             request = MoveStage.Request(target=Point(x=x_m), relative=relative)
-            return graph.call(MoveStage, "stage/move", request)
+            return graph.call(topics.MOVE_STAGE, request)
 
         answer = move(0.004)
         assert answer.success
@@ -662,7 +662,7 @@ def test_the_stage_moves_within_its_limits_and_tells_where_it_is() -> None:
         assert later[0].pose.position.x == pytest.approx(0.005)
         driver.kind = "alarm"
         wait(lambda: node.health().level == "error", "the alarm")
-        assert graph.call(Trigger, "stage/clear", Trigger.Request()).success
+        assert graph.call(topics.CLEAR_STAGE, Trigger.Request()).success
         wait(lambda: node.health().level == "ok", "the end of the alarm")
 
 
@@ -671,7 +671,7 @@ def test_a_stage_that_is_missing_is_told_and_found_when_it_comes() -> None:
         driver = FakeStage()
         driver.gone = True
         node = graph.add(StageNode, lambda: driver)
-        refused = graph.call(Trigger, "stage/home", Trigger.Request())
+        refused = graph.call(topics.HOME_STAGE, Trigger.Request())
         assert not refused.success
         assert "not connected" in refused.message
         driver.gone = False
@@ -696,7 +696,7 @@ class Rig:
         graph.add(StageNode, FakeStage, pose_rate_hz=50.0)
         graph.add(SynchronizerNode, timeout_s=0.4)
         self.node = graph.add(ReconstructNode, calibration_file=str(calibration))
-        self.clouds = graph.collect(PointCloud2, "reconstruct/points", LARGE)
+        self.clouds = graph.collect(topics.POINTS)
         wait(lambda: self.pair.camera.armed and self.pair.projector.opened, "the devices")
         wait(lambda: self.node.health().level == "ok", "the kernels", 200.0)
 
@@ -704,7 +704,7 @@ class Rig:
         self.clouds.clear()
         self.pair.runs = 0
         request = Scan.Request(sequence=sequence, max_repeats=max_repeats)
-        return self.graph.call(Scan, "scan", request, 60.0)
+        return self.graph.call(topics.SCAN, request, 60.0)
 
     def expect_good(self, answer: Scan.Response) -> None:
         assert answer.success, answer.message
@@ -790,19 +790,19 @@ def test_unknown_sequences_and_bad_exposures_are_refused_at_once(rig: Rig) -> No
     assert "no sequence is called 'nix'" in rig.scan(sequence="nix").message
     for exposure_s in (-1.0, math.nan, 1e9):
         request = Scan.Request(exposure_s=exposure_s)
-        assert "exposure_s" in rig.graph.call(Scan, "scan", request).message
+        assert "exposure_s" in rig.graph.call(topics.SCAN, request).message
 
 
 def test_the_action_tells_progress_and_a_second_scan_is_refused(rig: Rig) -> None:
     rig.clouds.clear()
     told: list[ScanAction.Feedback] = []
-    client = ActionClient(rig.graph.tester, ScanAction, "scan")
+    client = rig.graph.tester.action_client(topics.SCAN_ACTION)
     assert client.wait_for_server(ros_graph.PATIENCE_S)
     goal = ScanAction.Goal(sequence="precise", max_repeats=255)
     sent = client.send_goal_async(goal, lambda m: told.append(m.feedback))
     wait(sent.done, "the goal to be accepted")
     wait(lambda: told, "the first feedback")
-    second = rig.graph.call(Scan, "scan", Scan.Request())
+    second = rig.graph.call(topics.SCAN, Scan.Request())
     assert not second.success
     assert "running already" in second.message
     result = sent.result().get_result_async()
@@ -814,7 +814,7 @@ def test_the_action_tells_progress_and_a_second_scan_is_refused(rig: Rig) -> Non
 
 
 def test_a_scan_can_be_cancelled_and_the_next_one_is_right(rig: Rig) -> None:
-    client = ActionClient(rig.graph.tester, ScanAction, "scan")
+    client = rig.graph.tester.action_client(topics.SCAN_ACTION)
     assert client.wait_for_server(ros_graph.PATIENCE_S)
     goal = ScanAction.Goal(sequence="precise", exposure_s=10.0, max_repeats=0)
     sent = client.send_goal_async(goal)
@@ -835,6 +835,6 @@ def test_a_graph_without_a_camera_says_so(tmp_path: Path) -> None:
     with ros_graph.graph() as graph:
         graph.add(tiny_projector, FakeProjector)
         graph.add(ReconstructNode, calibration_file=str(path), silence_timeout_s=1.0)
-        answer = graph.call(Scan, "scan", Scan.Request())
+        answer = graph.call(topics.SCAN, Scan.Request())
         assert not answer.success
         assert "is the camera node running" in answer.message

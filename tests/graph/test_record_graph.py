@@ -17,11 +17,14 @@ from support.ros_graph import require_ros, wait
 
 require_ros()
 
-from sensor_msgs.msg import PointCloud2  # noqa: E402
-from sl_interfaces.msg import ScanReport  # noqa: E402
 from test_slrig_graph import READY_PATIENCE_S, Command  # noqa: E402
 
-from sl_bringup.bag.bags import (  # noqa: E402
+from sl_bringup.bag.bags import open_bag  # noqa: E402
+from sl_bringup.cli.main import main  # noqa: E402
+from sl_camera.sync.matching import MatcherSettings  # noqa: E402
+from sl_camera.synchronizer_node import SynchronizerNode  # noqa: E402
+from sl_common import topics  # noqa: E402
+from sl_common.topics import (  # noqa: E402
     CALIBRATION_RUN,
     CAMERA_INFO,
     CAMERA_SETTINGS,
@@ -31,12 +34,7 @@ from sl_bringup.bag.bags import (  # noqa: E402
     RECORDED_TOPICS,
     REPORT,
     SETTINGS,
-    open_bag,
 )
-from sl_bringup.cli.main import main  # noqa: E402
-from sl_camera.sync.matching import MatcherSettings  # noqa: E402
-from sl_camera.synchronizer_node import SynchronizerNode  # noqa: E402
-from sl_common.base_node import EVENTS, LARGE  # noqa: E402
 from sl_reconstruct.reconstruct_node import ReconstructNode  # noqa: E402
 
 SCANS = 2
@@ -133,8 +131,8 @@ def test_a_replay_gives_the_live_bits(live: tuple[Path, list]) -> None:
         nodes.add(SynchronizerNode, use_sim_time=True)
         reconstruct = nodes.add(ReconstructNode, use_sim_time=True)
         wait(lambda: reconstruct._ready, "the reconstruction", READY_PATIENCE_S)
-        reports = nodes.collect(ScanReport, "reconstruct/report", EVENTS)
-        nodes.collect(PointCloud2, "reconstruct/points", LARGE)  # else nothing is reconstructed
+        reports = nodes.collect(topics.REPORT)
+        nodes.collect(topics.POINTS)  # else nothing is reconstructed
         bag, domain = str(folder / "whole"), f"{nodes.domain}"
         command = Command("replay", bag, "--rate", "2", "--domain", domain)
         assert command.end(patience_s=REPLAY_PATIENCE_S) == 0, command.text

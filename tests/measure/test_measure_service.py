@@ -21,6 +21,7 @@ ros_graph.require_ros()
 
 from sl_interfaces.srv import Measure  # noqa: E402
 
+from sl_common import topics  # noqa: E402
 from sl_common.base_node import RigNode  # noqa: E402
 from sl_reconstruct.cloud.cloud import CLOUD_DTYPE  # noqa: E402
 from sl_reconstruct.cloud.cloud_writer import save_pcd  # noqa: E402
@@ -40,7 +41,7 @@ def groove() -> np.ndarray:
 class Measurer(RigNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("measurer", **options)
-        self.service = MeasureService(self, self.long_work)
+        self.service = MeasureService(self)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +60,7 @@ def graph() -> Iterator[ros_graph.Graph]:
 
 
 def call(graph: ros_graph.Graph, **request: Any) -> Any:
-    return graph.call(Measure, "measure", Measure.Request(**request))
+    return graph.call(topics.MEASURE, Measure.Request(**request))
 
 
 def test_the_last_cloud_is_measured(graph) -> None:

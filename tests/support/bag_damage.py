@@ -18,9 +18,10 @@ from test_evaluate_many import START_NS, write_scans
 
 from sl_bringup.bag.bag_recorder import BagRecorder
 from sl_bringup.bag.bag_writer import new_bag, topic_qos
-from sl_bringup.bag.bags import CALIBRATION, TOPICS, open_bag
+from sl_bringup.bag.bags import open_bag
 from sl_bringup.evaluation.evaluation import Choices, Crew, evaluate_bag
 from sl_common.errors import SlError
+from sl_common.topics import CALIBRATION, EVALUATED_TOPICS
 from sl_reconstruct.cloud.cloud_reader import read_cloud
 from sl_reconstruct.model.calibration_file import Calibration
 from support.tiny_scans import HEIGHT_M, SLOPE, render, tiny_rig, tiny_sequence
@@ -41,9 +42,9 @@ def make(kind: str, path: Path) -> Path:
     if plain != path:
         split = 600_000 if kind == "split" else 0
         with open_bag(plain) as old, BagRecorder(path, {}, split, kind == "compressed") as new:
-            for topic in TOPICS:
+            for topic in EVALUATED_TOPICS:
                 new.add_topic(f"/sl/{topic.name}", topic.msgtype, topic_qos(topic))
-            for raw in old.raw(CALIBRATION, *TOPICS[:3]):
+            for raw in old.raw(CALIBRATION, *EVALUATED_TOPICS[:3]):
                 name = f"/sl/{raw.topic.name}"
                 new.write(name, raw.received_ns, raw.received_ns, bytes(raw.data))
     return path

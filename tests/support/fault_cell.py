@@ -14,9 +14,9 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point
-from sl_interfaces.msg import MatchedFrame, PatternStack
+from sl_interfaces.msg import MatchedFrame
 from sl_interfaces.srv import MoveStage, Project
 from std_srvs.srv import Trigger
 
@@ -33,8 +33,7 @@ from sl_camera.stage.grbl.grbl_stage import GrblStage
 from sl_camera.stage.zaber.zaber_stage import ZaberStage
 from sl_camera.stage_node import StageNode
 from sl_camera.synchronizer_node import SynchronizerNode
-from sl_common import base_node, device_link
-from sl_common.base_node import EVENTS, LARGE
+from sl_common import base_node, device_link, topics
 from sl_projector.dlpc.dlpc900_driver import Dlpc900, Dlpc900Settings
 from sl_projector.hid.usb_socket import LinkBackend
 from sl_projector.projector_node import ProjectorNode
@@ -94,12 +93,10 @@ class Cell:
                 jitter_fraction=0.4,
             ),
         ]  # fmt: skip
-        self.stacks = self.graph.collect(PatternStack, "synchronizer/stack", LARGE)
-        self.verdicts = self.graph.collect(MatchedFrame, "synchronizer/frame", EVENTS)
+        self.stacks = self.graph.collect(topics.STACK)
+        self.verdicts = self.graph.collect(topics.FRAME)
         self.diagnostics: list[DiagnosticStatus] = []
-        self.graph.tester.create_subscription(
-            DiagnosticArray, "/diagnostics", lambda m: self.diagnostics.extend(m.status), 50
-        )
+        self.graph.tester.listen(topics.DIAGNOSTICS, lambda m: self.diagnostics.extend(m.status))
         self.recover()
 
     def _make_stage(self) -> Any:
@@ -120,7 +117,7 @@ class Cell:
     def project(self) -> tuple[Any, MatchedFrame | None]:
         """Project `paper`; the answer, and the synchroniser's verdict where a pattern was shown."""
         self.verdicts.clear()
-        answer = self.graph.call(Project, "projector/project", Project.Request(), PATIENCE_S)
+        answer = self.graph.call(topics.PROJECT, Project.Request(), PATIENCE_S)
         if not answer.count:
             return answer, None
         over = (MatchedFrame.STACK_COMPLETE, MatchedFrame.STACK_REFUSED)
@@ -131,20 +128,18 @@ class Cell:
 
         return answer, wait(verdict, "the verdict on a projection", PATIENCE_S)
 
-    def call(self, name: str) -> Any:
+    def call(self, service: topics.Service) -> Any:
         """Call a service that takes nothing."""
-        return self.graph.call(Trigger, name, Trigger.Request(), PATIENCE_S)
+        return self.graph.call(service, Trigger.Request(), PATIENCE_S)
 
     def move(self, x_m: float) -> Any:
         """Move the stage and wait."""
         request = MoveStage.Request(target=Point(x=x_m))
-        return self.graph.call(MoveStage, "stage/move", request, PATIENCE_S)
+        return self.graph.call(topics.MOVE_STAGE, request, PATIENCE_S)
 
     def begin_move(self, x_m: float) -> Any:
         """Move the stage, do not wait."""
-        return self.graph.call_async(
-            MoveStage, "stage/move", MoveStage.Request(target=Point(x=x_m))
-        )
+        return self.graph.call_async(topics.MOVE_STAGE, MoveStage.Request(target=Point(x=x_m)))
 
     # -- what the user sees ---------------------------------------------------------------------
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from sl_common.topics import NAMESPACE, Service, Topic
 from support.domains import ReservedDomain
 
 #: Discovery takes up to 2.2 s on a busy machine; whoever waits for it waits longer.
@@ -49,12 +50,14 @@ class Graph:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
 
+        from sl_common.base_node import GraphNode
+
         self.context = rclpy.Context()
         self._reserved = ReservedDomain()
         self.domain = self._reserved.number
         rclpy.init(context=self.context, domain_id=self.domain)
         self.executor = SingleThreadedExecutor(context=self.context)
-        self.tester = rclpy.create_node("tester", namespace="sl", context=self.context)
+        self.tester = GraphNode("tester", namespace=NAMESPACE, context=self.context)
         self.executor.add_node(self.tester)
         self._nodes: list[Any] = []
         self._ended = threading.Event()
@@ -83,30 +86,30 @@ class Graph:
         node.close()
         node.destroy_node()
 
-    def publisher(self, kind: Any, topic: str, qos: Any) -> Any:
+    def publisher(self, topic: Topic) -> Any:
         """Make a publisher that has found its subscriber."""
-        publisher = self.tester.create_publisher(kind, topic, qos)
-        wait(publisher.get_subscription_count, f"a subscriber of {topic}")
+        publisher = self.tester.advertise(topic)
+        wait(publisher.get_subscription_count, f"a subscriber of {topic.name}")
         return publisher
 
-    def collect(self, kind: Any, topic: str, qos: Any) -> list[Any]:
+    def collect(self, topic: Topic) -> list[Any]:
         """Messages of a topic as they come; its publisher has been found."""
         found: list[Any] = []
-        subscription = self.tester.create_subscription(kind, topic, found.append, qos)
-        wait(lambda: self.tester.count_publishers(topic), f"a publisher of {topic}")
-        wait(lambda: subscription.get_publisher_count(), f"a publisher of {topic}")
+        subscription = self.tester.listen(topic, found.append)
+        wait(lambda: self.tester.count_publishers(topic.name), f"a publisher of {topic.name}")
+        wait(lambda: subscription.get_publisher_count(), f"a publisher of {topic.name}")
         return found
 
-    def call(self, kind: Any, service: str, request: Any, timeout_s: float = PATIENCE_S) -> Any:
+    def call(self, service: Service, request: Any, timeout_s: float = PATIENCE_S) -> Any:
         """Call a service and wait for its answer."""
-        future = self.call_async(kind, service, request)
-        wait(future.done, f"an answer of {service}", timeout_s)
+        future = self.call_async(service, request)
+        wait(future.done, f"an answer of {service.name}", timeout_s)
         return future.result()
 
-    def call_async(self, kind: Any, service: str, request: Any) -> Any:
+    def call_async(self, service: Service, request: Any) -> Any:
         """Call a service."""
-        client = self.tester.create_client(kind, service)
-        assert client.wait_for_service(PATIENCE_S), f"nobody offers {service}"
+        client = self.tester.client(service)
+        assert client.wait_for_service(PATIENCE_S), f"nobody offers {service.name}"
         return client.call_async(request)
 
     def close(self) -> None:

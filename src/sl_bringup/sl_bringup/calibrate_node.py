@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rclpy.action import ActionClient
 from sl_interfaces.action import Calibrate
 from sl_interfaces.srv import Verify
 
@@ -16,6 +15,7 @@ from sl_bringup.cli.calibrate import outcome_lines
 from sl_bringup.client_node import GraphClient, run_client
 from sl_bringup.graph.console import say
 from sl_bringup.results.paper_tables import table_1_lines
+from sl_common import topics
 
 
 class CalibrateClient(GraphClient):
@@ -29,8 +29,8 @@ class CalibrateClient(GraphClient):
 
     def __init__(self, namespace: str) -> None:
         super().__init__("calibrate_client", namespace)
-        self._action = ActionClient(self, Calibrate, "calibration/calibrate")
-        self._verify = self.create_client(Verify, "calibration/verify")
+        self._action = self.action_client(topics.CALIBRATE_ACTION)
+        self._verify = self.client(topics.VERIFY)
 
     def calibrate(self, goal: Calibrate.Goal, connect_s: float, patience_s: float) -> Any:
         """Calibrate, and return the action's result; cancelled as by `carry_out`.
@@ -42,13 +42,13 @@ class CalibrateClient(GraphClient):
         DeviceTimeout
             When the graph does not answer in time.
         """
-        self.await_graph(self._action.server_is_ready, "calibration/calibrate", connect_s)
+        self.await_graph(self._action.server_is_ready, topics.CALIBRATE, connect_s)
         return self.carry_out(self._action, goal, self._feedback, patience_s)
 
     def verify(self, request: Verify.Request, connect_s: float, patience_s: float) -> Any:
         """Check the calibration in force, and return the service's answer; errors as above."""
         # A request to a service that is not found yet would be lost.
-        self.await_graph(self._verify.service_is_ready, "calibration/verify", connect_s)
+        self.await_graph(self._verify.service_is_ready, topics.VERIFY, connect_s)
         return self.answer(self._verify.call_async(request), patience_s)
 
     def _feedback(self, message: Any) -> None:

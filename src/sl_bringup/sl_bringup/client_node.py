@@ -9,18 +9,19 @@ from collections.abc import Callable
 from typing import Any
 
 import rclpy
-from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from sl_bringup.graph.console import complain
+from sl_common.base_node import GraphNode
 from sl_common.errors import DeviceLost, DeviceTimeout, SlError
+from sl_common.topics import Service
 
 INTERRUPTED = 130
 #: A cancelled goal ends when stage and projector have stopped.
 CANCEL_S = 20.0
 
 
-class GraphClient(Node):  # type: ignore[misc]  # rclpy carries no types
+class GraphClient(GraphNode):
     """A node that asks for something, shows progress in one line, and ends.
 
     Parameters
@@ -35,15 +36,15 @@ class GraphClient(Node):  # type: ignore[misc]  # rclpy carries no types
         super().__init__(name, namespace=namespace)
         self._shown = ""
 
-    def await_graph(self, is_there: Callable[[], bool], wanted: str, patience_s: float) -> None:
+    def await_graph(self, is_there: Callable[[], bool], wanted: Service, patience_s: float) -> None:
         """Wait until what is wanted of the graph is offered.
 
         Parameters
         ----------
         is_there : callable
             Whether it is.
-        wanted : str
-            What it is, below the namespace.
+        wanted : Service
+            What it is.
         patience_s : float
             Longest wait, seconds.
 
@@ -54,7 +55,7 @@ class GraphClient(Node):  # type: ignore[misc]  # rclpy carries no types
         """
         if not self.until(is_there, patience_s):
             raise DeviceLost(
-                f"no node offers {self.get_namespace()}/{wanted} in domain "
+                f"no node offers {self.get_namespace()}/{wanted.name} in domain "
                 f"{self.context.get_domain_id()}; start the graph with 'slrig up', or use --up"
             )
 

@@ -9,19 +9,21 @@ from collections.abc import Sequence
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
 
 from sl_bringup.graph.console import complain, say
+from sl_common import topics
+from sl_common.base_node import GraphNode
 
 SERVICES = (
-    "projector/project", "stage/move", "stage/home", "scan", "scan/_action/send_goal", "measure",
-    "calibration/calibrate", "calibration/calibrate/_action/send_goal",
-)  # fmt: skip
+    *(s.name for s in (topics.PROJECT, topics.MOVE_STAGE, topics.HOME_STAGE, topics.SCAN)),
+    *(s.name for s in (topics.MEASURE, topics.CALIBRATE)),
+    *(f"{a.name}/_action/send_goal" for a in (topics.SCAN_ACTION, topics.CALIBRATE_ACTION)),
+)
 #: What is missing is said when it has been so for the first wait, and again after the second.
 PATIENCE_S, REPEAT_S = 5.0, 20.0
 
 
-class ReadyNode(Node):  # type: ignore[misc]  # rclpy carries no types
+class ReadyNode(GraphNode):
     """Watches `/diagnostics` and the graph.
 
     Parameters
@@ -37,9 +39,9 @@ class ReadyNode(Node):  # type: ignore[misc]  # rclpy carries no types
         self._nodes = nodes
         self._said: dict[str, tuple[bytes, str]] = {}
         self._calibrations: dict[str, str] = {}
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._listen, 50)
+        self.listen(topics.DIAGNOSTICS, self._on_diagnostics)
 
-    def _listen(self, message: DiagnosticArray) -> None:
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             name, level = status.name.partition(":")[0], status.level
             values = {item.key: item.value for item in status.values}

@@ -3,40 +3,47 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import signal
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import rclpy
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
 from sl_bringup.bag.bag_recorder import BagRecorder
 from sl_bringup.bag.bag_writer import topic_qos
-from sl_bringup.bag.bags import IMAGE, RECORDED_TOPICS, TOPICS, TRIGGER, Topic
 from sl_bringup.graph.console import StatusLine, complain, say
 from sl_bringup.graph.version import software_version
+from sl_common.base_node import GraphNode, interface_class, qos_profile
 from sl_common.errors import BagError, SlError
+from sl_common.topics import (
+    EVALUATED_TOPICS,
+    IMAGE,
+    LARGE,
+    POINTS,
+    RECORDED_TOPICS,
+    STACK,
+    TRIGGER,
+    Topic,
+)
 
 #: Messages that may wait while the disk does: two seconds of images at 100 Hz.
 DEPTH = 256
 #: Stacks and clouds, with ``--all``: each is 20 to 100 MB.
-LARGE_TYPES = ("sl_interfaces/msg/PatternStack", "sensor_msgs/msg/PointCloud2")
-LARGE_DEPTH = 4
+LARGE_TYPES = (STACK.msgtype, POINTS.msgtype)
 FLUSH_S, LOOK_S, SHOW_S, SILENCE_S, SETTLE_S = 0.1, 0.5, 1.0, 5.0, 1.0
 #: At the end, what has arrived already is still taken.
 DRAIN_S = 0.3
 
 
-class RecordNode(Node):  # type: ignore[misc]  # rclpy carries no types
+class RecordNode(GraphNode):
     """Subscribes raw and writes.
 
     Parameters
@@ -54,12 +61,12 @@ class RecordNode(Node):  # type: ignore[misc]  # rclpy carries no types
         self._bag = bag
         self._refused: set[str] = set()
         self._images, self._triggers = (f"{namespace}/{t.name}" for t in (IMAGE, TRIGGER))
-        self._needed = [f"{namespace}/{topic.name}" for topic in TOPICS]
+        self._needed = [f"{namespace}/{topic.name}" for topic in EVALUATED_TOPICS]
         self.lost: Counter[str] = Counter()
         #: Why nothing can be written any more; empty while all is well.
         self.fault = ""
         for topic in RECORDED_TOPICS:
-            self._subscribe(f"{namespace}/{topic.name}", topic, topic.latched)
+            self._subscribe(f"{namespace}/{topic.name}", topic)
         self.create_timer(FLUSH_S, self._flush)
         if everything:
             self.create_timer(LOOK_S, self._look)
@@ -85,15 +92,17 @@ class RecordNode(Node):  # type: ignore[misc]  # rclpy carries no types
         """Topics without a publisher that an evaluation needs."""
         return [name for name in self._needed if not self.count_publishers(name)]
 
-    def _subscribe(self, name: str, topic: Topic, latched: bool) -> None:
-        kind = message_type(topic.msgtype)
+    def _subscribe(self, name: str, topic: Topic) -> None:
+        kind = interface_class(topic.msgtype)
         self._bag.add_topic(name, topic.msgtype, topic_qos(topic))
         events = SubscriptionEventCallbacks(
             message_lost=lambda event: self._count_lost(name, event.total_count_change),
             incompatible_qos=lambda _: complain(f"slrig record: {name} offers an unfit QoS"),
         )
         write = partial(self._write, name)
-        qos = subscription_qos(topic.msgtype, latched)
+        # Deep enough that the disk may pause.
+        depth = LARGE if topic.msgtype in LARGE_TYPES else DEPTH
+        qos = qos_profile(replace(topic, depth=depth))
         self.create_subscription(kind, name, write, qos, event_callbacks=events, raw=True)
 
     def _write(self, name: str, data: bytes, info: Mapping[str, int]) -> None:
@@ -125,10 +134,9 @@ class RecordNode(Node):  # type: ignore[misc]  # rclpy carries no types
                 continue
             try:
                 latched, reliable = self._offered(name)
-                topic = Topic(name, kinds[0], latched)
                 if not reliable and not latched:
                     complain(f"slrig record: {name} is best effort; some of it may be lost")
-                self._subscribe(name, topic, latched)
+                self._subscribe(name, Topic(name, kinds[0], latched=latched))
             except (BagError, ImportError, AttributeError) as error:
                 self._refused.add(name)
                 complain(f"slrig record: not recorded: {error}")
@@ -139,22 +147,6 @@ class RecordNode(Node):  # type: ignore[misc]  # rclpy carries no types
         latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
         reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
         return bool(profiles) and latched, reliable
-
-
-def message_type(name: str) -> Any:
-    """Class of ``package/msg/Type``."""
-    package, _, kind = name.split("/")
-    return getattr(importlib.import_module(f"{package}.msg"), kind)
-
-
-def subscription_qos(msgtype: str, latched: bool) -> QoSProfile:
-    """Deep enough that a disk may pause."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=LARGE_DEPTH if msgtype in LARGE_TYPES else DEPTH,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
 
 
 class _Stop:

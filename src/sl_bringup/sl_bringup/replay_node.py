@@ -10,24 +10,21 @@ from pathlib import Path
 import rclpy
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
-from sl_bringup.bag.bags import RAW_TOPICS, RECORDED_TOPICS, Bag, Raw, Topic, open_bag
+from sl_bringup.bag.bags import Bag, Raw, open_bag
 from sl_bringup.graph.console import StatusLine, complain, say
-from sl_bringup.record_node import message_type
+from sl_common.base_node import GraphNode
 from sl_common.errors import BagError, SlError
+from sl_common.topics import CLOCK, RAW_TOPICS, RECORDED_TOPICS, Topic
 from sl_projector.sequence.messages import stamp_to_msg
 
-#: A whole sequence waits for a busy listener.
-DEPTH = 64
 CLOCK_S, SHOW_S = 0.01, 1.0
 #: Listeners of one process are discovered one after the other.
 SETTLE_S = 0.5
 
 
-class ReplayNode(Node):  # type: ignore[misc]  # rclpy carries no types
+class ReplayNode(GraphNode):
     """Publishes what a bag holds.
 
     Parameters
@@ -40,13 +37,8 @@ class ReplayNode(Node):  # type: ignore[misc]  # rclpy carries no types
 
     def __init__(self, namespace: str, topics: Sequence[Topic]) -> None:
         super().__init__("player", namespace=namespace)
-        self._clock_topic = self.create_publisher(Clock, "/clock", 10)
-        self._to = {
-            topic: self.create_publisher(
-                message_type(topic.msgtype), f"{namespace}/{topic.name}", publisher_qos(topic)
-            )
-            for topic in topics
-        }
+        self._clock_topic = self.advertise(CLOCK)
+        self._to = {topic: self.advertise(topic) for topic in topics}
         self.count = 0
 
     def await_listeners(self, patience_s: float) -> bool:
@@ -88,16 +80,6 @@ class ReplayNode(Node):  # type: ignore[misc]  # rclpy carries no types
 
     def _tell_time(self, now_ns: int) -> None:
         self._clock_topic.publish(Clock(clock=stamp_to_msg(now_ns)))
-
-
-def publisher_qos(topic: Topic) -> QoSProfile:
-    """As the devices offer it."""
-    durability = DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE
-    return QoSProfile(
-        depth=1 if topic.latched else DEPTH,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=durability,
-    )
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:

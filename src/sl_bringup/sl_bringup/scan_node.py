@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.action import ActionClient
 from sensor_msgs.msg import Image, PointCloud2
 from sl_interfaces.action import Scan
 from sl_interfaces.msg import ScanReport
@@ -19,7 +18,7 @@ from sl_interfaces.msg import ScanReport
 from sl_bringup.client_node import GraphClient, run_client
 from sl_bringup.graph.console import complain, say
 from sl_bringup.results.scan_result import MEASURES, check_cloud, live_report, summary, write_result
-from sl_common.base_node import LARGE
+from sl_common import topics
 from sl_reconstruct.messages import cloud_from_msg, refusals_from_msg
 
 #: The cloud is sent before the action's result; it may still be later by so long.
@@ -40,9 +39,9 @@ class ScanClient(GraphClient):
         super().__init__("scan_client", namespace)
         self._cloud: PointCloud2 | None = None
         self._refusals: Image | None = None
-        self._action = ActionClient(self, Scan, "scan")
-        self.create_subscription(PointCloud2, "reconstruct/points", self._take, LARGE)
-        self.create_subscription(Image, "reconstruct/refusals", self._take_refusals, LARGE)
+        self._action = self.action_client(topics.SCAN_ACTION)
+        self.listen(topics.POINTS, self._take)
+        self.listen(topics.REFUSALS, self._take_refusals)
 
     def connect(self, patience_s: float) -> None:
         """Wait for the graph.
@@ -53,10 +52,8 @@ class ScanClient(GraphClient):
             When no node offers the action.
         """
         self.await_graph(
-            lambda: (
-                self._action.server_is_ready() and self.count_publishers("reconstruct/points") > 0
-            ),
-            "scan",
+            lambda: self._action.server_is_ready() and self.count_publishers(topics.POINTS.name),
+            topics.SCAN,
             patience_s,
         )
 

@@ -11,13 +11,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from geometry_msgs.msg import Point, PoseStamped
-from sl_interfaces.msg import MatchedFrame, PatternStack
+from geometry_msgs.msg import Point
+from sl_interfaces.msg import MatchedFrame
 from sl_interfaces.srv import MoveStage
 from std_srvs.srv import Trigger
 
 from sl_calibration.data.session import Place, RunCancelled, Taken, in_words
-from sl_common.base_node import EVENTS, LARGE, RigNode, next_scan_id
+from sl_common import topics
+from sl_common.base_node import RigNode, next_scan_id
 from sl_common.errors import CalibrationError, DeviceError, DeviceTimeout, SlError
 from sl_projector.sequence.messages import stamp_from_msg
 from sl_reconstruct.messages import stack_from_msg
@@ -46,10 +47,9 @@ class GraphDevices:
 
     def __init__(self, node: RigNode) -> None:
         self._node = node
-        group = node.long_work
-        self._move = node.create_client(MoveStage, "stage/move", callback_group=group)
-        self._stop_stage = node.create_client(Trigger, "stage/stop", callback_group=group)
-        self._projector = ProjectorClient(node, group)
+        self._move = node.client(topics.MOVE_STAGE)
+        self._stop_stage = node.client(topics.STOP_STAGE)
+        self._projector = ProjectorClient(node)
         self._watch: ScanWatch | None = None
         self._last_id = 0
         self._cancelled: Callable[[], bool] = lambda: False
@@ -64,9 +64,9 @@ class GraphDevices:
         """Listen to the synchroniser for one run; its stacks are too large to listen always."""
         self._cancelled = cancelled
         subscriptions = [
-            self._node.subscribe(MatchedFrame, "synchronizer/frame", self._on_frame, EVENTS),
-            self._node.subscribe(PatternStack, "synchronizer/stack", self._on_stack, LARGE),
-            self._node.subscribe(PoseStamped, "stage/pose", self._on_pose, EVENTS),
+            self._node.listen(topics.FRAME, self._on_frame),
+            self._node.listen(topics.STACK, self._on_stack),
+            self._node.listen(topics.POSE, self._on_pose),
         ]
         try:
             self._await_publishers(subscriptions)
@@ -131,7 +131,7 @@ class GraphDevices:
         end_s = time.monotonic() + self.settle_s + _ANSWER_S
         while self._pose_ns < settled_ns:
             if time.monotonic() > end_s:
-                raise DeviceTimeout("stage/pose is silent: is the stage node running?")
+                raise DeviceTimeout(f"{topics.POSE.name} is silent: is the stage node running?")
             self._pause()
         return _position(reply.pose)
 
@@ -141,13 +141,13 @@ class GraphDevices:
     def _ask(self, place: Place, relative: bool = False, check_only: bool = False) -> Any:
         """Ask the stage node; what it refuses is raised with its reason."""
         if not self._move.wait_for_service(timeout_sec=_DISCOVERY_S):
-            raise DeviceError("nobody offers stage/move: is the stage node running?")
+            raise DeviceError(f"nobody offers {topics.MOVE_STAGE.name}: is the stage node running?")
         x, y, z = place
         request = MoveStage.Request(
             target=Point(x=x, y=y, z=z), relative=relative, check_only=check_only
         )
         patience_s = _ANSWER_S if check_only else self.move_timeout_s
-        reply = self._answer(self._move.call_async(request), patience_s, "stage/move")
+        reply = self._answer(self._move.call_async(request), patience_s, topics.MOVE_STAGE.name)
         if not reply.success:
             raise DeviceError(reply.message)
         return reply
@@ -221,8 +221,8 @@ class GraphDevices:
     def _gap(self) -> str:
         if gap := self._projector.gap():
             return gap
-        if not self._node.count_publishers("camera/image_raw"):
-            return "nobody publishes camera/image_raw: is the camera node running?"
+        if not self._node.count_publishers(topics.IMAGE.name):
+            return f"nobody publishes {topics.IMAGE.name}: is the camera node running?"
         return ""
 
     def project(self, watch: ScanWatch, order: ScanRequest) -> None:

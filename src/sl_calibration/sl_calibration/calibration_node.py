@@ -15,10 +15,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rclpy.action import ActionServer, CancelResponse
 from sl_interfaces.action import Calibrate as CalibrateAction
 from sl_interfaces.msg import RigCalibration
-from sl_interfaces.srv import Calibrate, Verify
 from std_msgs.msg import String
 
 from sl_calibration.acquisition_node import GraphDevices
@@ -30,16 +28,8 @@ from sl_calibration.verify.verification import VerifyLimits
 from sl_calibration.workflow.calibrator import Calibrator, InForce, Pitches, VerifyOutcome
 from sl_calibration.workflow.conclude import Outcome
 from sl_calibration.workflow.warm_up import warm_up_apart
-from sl_common.base_node import (
-    CAMERA_FRAME,
-    EVENTS,
-    LATCHED,
-    PROJECTOR_FRAME,
-    WORLD_FRAME,
-    Health,
-    RigNode,
-    run,
-)
+from sl_common import topics
+from sl_common.base_node import Health, RigNode, run
 from sl_common.errors import CalibrationError, SlError
 from sl_projector.sequence.messages import stamp_from_msg
 from sl_reconstruct.messages import rig_to_msg
@@ -48,7 +38,6 @@ from sl_reconstruct.scan.scan_flow import ScanTimeouts
 
 _LimitsT = TypeVar("_LimitsT", Limits, VerifyLimits)
 
-FRAMES = (WORLD_FRAME, CAMERA_FRAME, PROJECTOR_FRAME)
 _HEIGHTS_M = [-1e-3, -0.5e-3, 0.0, 0.5e-3, 1e-3]
 
 
@@ -70,24 +59,16 @@ class CalibrationNode(RigNode):
         self._since_ns = 0
         self._fault = "not calibrated"
         self._last = "no run yet"
-        self._rigs = self.create_publisher(RigCalibration, "calibration/rig", LATCHED)
-        self.subscribe(RigCalibration, "calibration/rig", self._on_rig, LATCHED)
+        self._rigs = self.advertise(topics.CALIBRATION)
+        self.listen(topics.CALIBRATION, self._on_rig)
         self._load()
         self._offer()
         self._compiler = warm_up_apart()
 
     def _offer(self) -> None:
-        group = self.long_work
-        self.create_service(Calibrate, "calibration/calibrate", self._serve, callback_group=group)
-        self.create_service(Verify, "calibration/verify", self._serve_verify, callback_group=group)
-        self._action = ActionServer(
-            self,
-            CalibrateAction,
-            "calibration/calibrate",
-            self._execute,
-            callback_group=group,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
-        )
+        self.serve(topics.CALIBRATE, self._serve)
+        self.serve(topics.VERIFY, self._serve_verify)
+        self._action = self.serve_action(topics.CALIBRATE_ACTION, self._execute)
 
     # -- parameters -----------------------------------------------------------------------------
 
@@ -170,7 +151,7 @@ class CalibrationNode(RigNode):
         return self.get_parameter(name).value
 
     def _make_calibrator(self) -> Calibrator:
-        self._runs = self.create_publisher(String, "calibration/run", EVENTS)
+        self._runs = self.advertise(topics.CALIBRATION_RUN)
         return Calibrator(
             self._store, self._limits, self._pitches, self._stage_tolerance_m, self._verify_limits,
             record=self._publish_run,
@@ -197,7 +178,7 @@ class CalibrationNode(RigNode):
 
     def _put_in_force(self, calibration: Calibration, source: str, since_ns: int) -> None:
         self._in_force, self._source, self._since_ns = calibration, source, since_ns
-        self._rigs.publish(rig_to_msg(calibration, source, since_ns, FRAMES))
+        self._rigs.publish(rig_to_msg(calibration, source, since_ns))
         self.get_logger().info(f"calibration {calibration.hash[:12]} of {source} is in force")
 
     def _on_rig(self, message: RigCalibration) -> None:
@@ -205,7 +186,9 @@ class CalibrationNode(RigNode):
         stamp_ns = stamp_from_msg(message.header.stamp)
         if stamp_ns <= self._since_ns:
             return
-        calibration = parse_calibration(message.yaml, f"calibration/rig ({message.source})")
+        calibration = parse_calibration(
+            message.yaml, f"{topics.CALIBRATION.name} ({message.source})"
+        )
         self._in_force, self._source = calibration, message.source
         self._since_ns = stamp_ns
 

@@ -12,9 +12,8 @@ from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo
 from sl_interfaces.msg import PatternTrigger, RigCalibration
-from std_srvs.srv import Trigger
 
 from sl_camera.camera.camera import (
     PIXEL_BITS,
@@ -30,16 +29,8 @@ from sl_camera.drivers.aravis_camera import AravisOptions
 from sl_camera.drivers.camera_drivers import ADDRESSES, make_camera
 from sl_camera.drivers.uvc_camera import UvcOptions
 from sl_camera.messages import camera_info_for, image_to_msg
-from sl_common.base_node import (
-    CAMERA_FRAME,
-    EVENTS,
-    IMAGES,
-    LATCHED,
-    Health,
-    RigNode,
-    device_health,
-    run,
-)
+from sl_common import topics
+from sl_common.base_node import Health, RigNode, device_health, run
 from sl_common.device_link import DeviceLink
 from sl_common.errors import DeviceError, DeviceRefused, SlError
 from sl_projector.sequence.messages import stamp_from_msg
@@ -71,21 +62,21 @@ class CameraNode(RigNode):
         self._calibrated: CameraInfo | None = None
         self._calibrated_ns = 0
         self._full_scale_dn = 0
-        self._tell_settings = self.latch_settings("camera/settings")
+        self._tell_settings = self.latch_settings(topics.CAMERA_SETTINGS)
         self._statistics = CameraStatistics()
         self._orders: SimpleQueue[tuple[CameraSettings, Future[None]]] = SimpleQueue()
         self._stop = threading.Event()
-        self._images = self.create_publisher(Image, "camera/image_raw", IMAGES)
-        self._infos = self.create_publisher(CameraInfo, "camera/camera_info", IMAGES)
-        self.subscribe(RigCalibration, "calibration/rig", self._on_calibration, LATCHED)
+        self._images = self.advertise(topics.IMAGE)
+        self._infos = self.advertise(topics.CAMERA_INFO)
+        self.listen(topics.CALIBRATION, self._on_calibration)
         self._windows = PatternWindows(
             self.declare(
                 "settle_s", 0.005, "software trigger: after a pattern's start, s", 0.0, 10.0
             )
         )
         if self._settings.trigger == "software":
-            self.subscribe(PatternTrigger, "projector/trigger", self._on_trigger, EVENTS)
-        self.create_service(Trigger, "camera/trigger", self._trigger)
+            self.listen(topics.TRIGGER, self._on_trigger)
+        self.serve(topics.TRIGGER_CAMERA, self._trigger)
         self.add_on_set_parameters_callback(self._on_parameters)
         self._link = DeviceLink("camera", self._connect, self.say)
         self._link.start()
@@ -202,10 +193,10 @@ class CameraNode(RigNode):
             try:
                 frame = self._windows.take(frame)
             except DeviceError as error:
-                self.complain("camera/image_raw", error)
+                self.complain(topics.IMAGE.name, error)
                 return
         self._tell(self._settings, frame.full_scale_dn)
-        image = image_to_msg(frame.image, frame.stamp_ns, CAMERA_FRAME)
+        image = image_to_msg(frame.image, frame.stamp_ns, topics.CAMERA_FRAME)
         self._images.publish(image)
         self._infos.publish(camera_info_for(self._calibrated, image))
 

@@ -9,15 +9,14 @@ from contextlib import contextmanager
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
-from sl_interfaces.srv import MoveStage
-from std_srvs.srv import Trigger
 
 from sl_camera.messages import stage_pose
 from sl_camera.stage.grbl.grbl_stage import GrblStage
 from sl_camera.stage.manual_stage import ManualStage
 from sl_camera.stage.stage import Position, StageDriver, StageState
 from sl_camera.stage.zaber.zaber_stage import ZaberStage, zaber_axes
-from sl_common.base_node import EVENTS, WORLD_FRAME, Health, RigNode, run
+from sl_common import topics
+from sl_common.base_node import Health, RigNode, run
 from sl_common.device_link import DeviceLink
 from sl_common.errors import (
     ConfigError,
@@ -54,14 +53,14 @@ class StageNode(RigNode):
         self._began_ns = 0  # the last motion; what is read later is not older
         self._state = StageState("lost", "not connected yet")
         self._stop = threading.Event()
-        self._poses = self.create_publisher(PoseStamped, "stage/pose", EVENTS)
-        self._serve(MoveStage, "stage/move", self._move)
-        self._serve(Trigger, "stage/home", self._home)
-        self._serve(Trigger, "stage/stop", self._halt)
-        self._serve(Trigger, "stage/clear", self._clear)
+        self._poses = self.advertise(topics.POSE)
+        self._serve(topics.MOVE_STAGE, self._move)
+        self._serve(topics.HOME_STAGE, self._home)
+        self._serve(topics.STOP_STAGE, self._halt)
+        self._serve(topics.CLEAR_STAGE, self._clear)
         if self._kind == "manual":
-            self._serve(Trigger, "stage/confirm", self._confirm)
-            self._serve(Trigger, "stage/give_up", self._give_up)
+            self._serve(topics.CONFIRM_STAGE, self._confirm)
+            self._serve(topics.GIVE_UP_STAGE, self._give_up)
         self._link = DeviceLink("stage", self._connect, self.say)
         self._link.start()
         self._poller = threading.Thread(target=self._poll, name="stage pose", daemon=True)
@@ -187,7 +186,7 @@ class StageNode(RigNode):
             self._moves -= 1
 
     def _pose(self, position_m: Position, stamp_ns: int) -> PoseStamped:
-        return stage_pose(position_m, stamp_ns, WORLD_FRAME)
+        return stage_pose(position_m, stamp_ns, topics.WORLD_FRAME)
 
     def _check_lost(self, driver: StageDriver, error: DeviceError) -> None:
         self.note(str(error))
@@ -196,7 +195,9 @@ class StageNode(RigNode):
 
     # -- services ---------------------------------------------------------------------------
 
-    def _serve(self, kind: Any, name: str, work: Callable[[StageDriver, Any, Any], None]) -> None:
+    def _serve(
+        self, service: topics.Service, work: Callable[[StageDriver, Any, Any], None]
+    ) -> None:
         """Offer a service whose work blocks; what goes wrong becomes its answer."""
 
         async def handle(request: Any, response: Any) -> Any:
@@ -207,15 +208,15 @@ class StageNode(RigNode):
                 await self.in_worker(do)
             except SlError as error:
                 response.success, response.message = False, str(error)
-                self.get_logger().error(f"{name} failed: {error}")
-                self.note(f"{name} failed: {error}")
+                self.get_logger().error(f"{service.name} failed: {error}")
+                self.note(f"{service.name} failed: {error}")
                 self._notice(error)
             except Exception as error:  # the caller gets an answer whatever happens
                 response.success, response.message = False, f"internal fault: {error!r}"
-                self.get_logger().error(f"{name} failed: {error!r}")
+                self.get_logger().error(f"{service.name} failed: {error!r}")
             return response
 
-        self.create_service(kind, name, handle, callback_group=self.long_work)
+        self.serve(service, handle)
 
     def _notice(self, error: SlError) -> None:
         """A service that lost the device leaves it to be opened anew."""

@@ -7,13 +7,14 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import Image
-from sl_interfaces.msg import MatchedFrame, PatternStack, PatternTrigger
+from sl_interfaces.msg import PatternTrigger
 
 from sl_camera.messages import decision_to_msg, stack_to_msg
 from sl_camera.sync.match_events import FrameDecision, MatchedStack, MatcherSettings, Status
 from sl_camera.sync.matching import StackMatcher
 from sl_camera.sync.message_fields import image_event, pose_event, trigger_event
-from sl_common.base_node import CAMERA_FRAME, EVENTS, IMAGES, LARGE, Health, RigNode, run
+from sl_common import topics
+from sl_common.base_node import Health, RigNode, run
 
 #: While a scan is open, time-outs and the settling time are looked at so often.
 TICK_S = 0.004
@@ -25,13 +26,13 @@ class SynchronizerNode(RigNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("synchronizer", **options)
         self._matcher = StackMatcher(self._declare_settings())
-        self.latch_settings("synchronizer/settings")(self._matcher.settings.to_dict())
+        self.latch_settings(topics.MATCHING)(self._matcher.settings.to_dict())
         self._last_verdict = "none yet"
-        self._frames = self.create_publisher(MatchedFrame, "synchronizer/frame", EVENTS)
-        self._stacks = self.create_publisher(PatternStack, "synchronizer/stack", LARGE)
-        self.subscribe(PatternTrigger, "projector/trigger", self._on_trigger, EVENTS)
-        self.subscribe(Image, "camera/image_raw", self._on_image, IMAGES)
-        self.subscribe(PoseStamped, "stage/pose", self._on_pose, EVENTS)
+        self._frames = self.advertise(topics.FRAME)
+        self._stacks = self.advertise(topics.STACK)
+        self.listen(topics.TRIGGER, self._on_trigger)
+        self.listen(topics.IMAGE, self._on_image)
+        self.listen(topics.POSE, self._on_pose)
         self._ticks = self.create_timer(TICK_S, self._on_tick, clock=self.steady)
         self._ticks.cancel()
 
@@ -73,7 +74,7 @@ class SynchronizerNode(RigNode):
     def _on_pose(self, message: PoseStamped) -> None:
         event = pose_event(message)
         if fault := event.fault():
-            self.complain("stage/pose", ValueError(fault))
+            self.complain(topics.POSE.name, ValueError(fault))
         self._publish(self._matcher.pose(event, time.monotonic_ns()))
 
     def _on_tick(self) -> None:
@@ -84,7 +85,7 @@ class SynchronizerNode(RigNode):
             self.counts[decision.status.name.lower()] += 1
             if decision.stack is not None:
                 self._publish_stack(decision.stack)
-            self._frames.publish(decision_to_msg(decision, CAMERA_FRAME))
+            self._frames.publish(decision_to_msg(decision, topics.CAMERA_FRAME))
             if decision.status not in (Status.MATCHED, Status.STACK_COMPLETE):
                 self.get_logger().warning(f"scan {decision.scan_id}: {decision.reason}")
             if decision.status in (Status.STACK_COMPLETE, Status.STACK_REFUSED):
@@ -96,7 +97,7 @@ class SynchronizerNode(RigNode):
 
     def _publish_stack(self, stack: MatchedStack) -> None:
         """Publish before the verdict, so that whoever hears the verdict can expect the stack."""
-        self._stacks.publish(stack_to_msg(stack, CAMERA_FRAME))
+        self._stacks.publish(stack_to_msg(stack, topics.CAMERA_FRAME))
         self._matcher.recycle(stack)
 
 

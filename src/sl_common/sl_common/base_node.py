@@ -1,11 +1,11 @@
-"""What every node of the graph shares: QoS, parameters, diagnostics, workers and `main`.
+"""What every node of the graph shares: topics, parameters, diagnostics, workers and `main`.
 
-It lies in this package because all others may import it. A node here never dies of a message:
-what is wrong with one becomes a count, a log line and a reply.
+A node never dies of a message: what is wrong with one becomes a count, a log line and a reply.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import sys
@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -28,30 +29,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from std_msgs.msg import String
 
+from sl_common import topics
 from sl_common.errors import SlError
-
-NAMESPACE = "sl"
-WORLD_FRAME = "sl_world"
-CAMERA_FRAME = "sl_camera_optical"
-PROJECTOR_FRAME = "sl_projector_optical"
+from sl_common.topics import Service, Topic
 
 _ResultT = TypeVar("_ResultT")
-
-
-def _qos(depth: int, latched: bool = False) -> QoSProfile:
-    durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=durability)
-
-
-#: Triggers, poses and verdicts: small, never to be missed.
-EVENTS = _qos(1024)
-#: Images: deeper than the longest built-in sequence, on both sides.
-IMAGES = _qos(64)
-#: Stacks and clouds of 20 to 100 MB: as many as memory allows to wait.
-LARGE = _qos(4)
-#: What a late subscriber needs as well.
-LATCHED = _qos(1, latched=True)
-
 
 #: A refusal is a warning on `/diagnostics` for so long: at least two messages.
 NOTED_S = 2.5
@@ -103,7 +85,52 @@ def device_health(connected: bool, reason: str) -> tuple[str, str]:
     return ("ok", "ready") if connected else ("error", reason)
 
 
-class RigNode(Node):  # type: ignore[misc]  # rclpy carries no types
+def interface_class(name: str) -> Any:
+    """Class of ``package/msg/Type`` (or ``srv``, ``action``)."""
+    package, kind, member = name.split("/")
+    return getattr(importlib.import_module(f"{package}.{kind}"), member)
+
+
+def qos_profile(topic: Topic) -> QoSProfile:
+    """QoS that publishers and subscribers of a topic have in common."""
+    durable, volatile = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
+    return QoSProfile(
+        depth=topic.depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=durable if topic.latched else volatile,
+    )
+
+
+class GraphNode(Node):  # type: ignore[misc]  # rclpy carries no types
+    """A node that takes topics, services and actions from `sl_common.topics`."""
+
+    def advertise(self, topic: Topic) -> Any:
+        """Return a publisher."""
+        return self.create_publisher(interface_class(topic.msgtype), topic.name, qos_profile(topic))
+
+    def listen(self, topic: Topic, handle: Callable[[Any], None]) -> Any:
+        """Subscribe.
+
+        Parameters
+        ----------
+        topic : Topic
+            What.
+        handle : callable
+            Called with each message.
+        """
+        kind = interface_class(topic.msgtype)
+        return self.create_subscription(kind, topic.name, handle, qos_profile(topic))
+
+    def client(self, service: Service) -> Any:
+        """Return a client of a service."""
+        return self.create_client(interface_class(service.kind), service.name)
+
+    def action_client(self, action: Service) -> ActionClient:
+        """Return a client of an action."""
+        return ActionClient(self, interface_class(action.kind), action.name)
+
+
+class RigNode(GraphNode):
     """A node of the rig: relative names in namespace ``/sl``, `/diagnostics` at 1 Hz.
 
     Parameters
@@ -115,13 +142,13 @@ class RigNode(Node):  # type: ignore[misc]  # rclpy carries no types
     """
 
     def __init__(self, name: str, **options: Any) -> None:
-        super().__init__(name, namespace=NAMESPACE, **options)
+        super().__init__(name, namespace=topics.NAMESPACE, **options)
         self.counts: Counter[str] = Counter()
         self.last_error = ""
         self._noted_s = -math.inf
         self.workers = ThreadPoolExecutor(4, thread_name_prefix=name)
         self.long_work = ReentrantCallbackGroup()
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._diagnostics = self.advertise(topics.DIAGNOSTICS)
         #: Timers run on it, so that a bag's clock that stands still does not stop them.
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(DIAGNOSTICS_S, self._publish_diagnostics, clock=self.steady)
@@ -134,9 +161,9 @@ class RigNode(Node):  # type: ignore[misc]  # rclpy carries no types
         """Give back what the node holds; called once, after the executor has stopped."""
         self.workers.shutdown(wait=True, cancel_futures=True)
 
-    def latch_settings(self, topic: str) -> Callable[[Mapping[str, object]], None]:
+    def latch_settings(self, topic: Topic) -> Callable[[Mapping[str, object]], None]:
         """Return what publishes settings on a latched topic, as JSON: recordings then hold them."""
-        publisher = self.create_publisher(String, topic, LATCHED)
+        publisher = self.advertise(topic)
 
         def tell(values: Mapping[str, object]) -> None:
             publisher.publish(String(data=json.dumps(values, sort_keys=True)))
@@ -166,27 +193,67 @@ class RigNode(Node):  # type: ignore[misc]  # rclpy carries no types
                 descriptor.integer_range = [span]
         return self.declare_parameter(name, default, descriptor).value
 
-    def subscribe(
-        self, kind: Any, topic: str, handle: Callable[[Any], None], qos: QoSProfile
-    ) -> Any:
-        """Subscribe so that no message can end the node, and lost ones are counted."""
+    def listen(self, topic: Topic, handle: Callable[[Any], None]) -> Any:
+        """Subscribe so that no message can end the node, and lost ones are counted.
+
+        Parameters
+        ----------
+        topic : Topic
+            What.
+        handle : callable
+            Called with each message; what it raises is counted and logged.
+        """
 
         def guarded(message: Any) -> None:
             try:
                 handle(message)
             except SlError as error:
-                self.complain(topic, error)
+                self.complain(topic.name, error)
             except Exception as error:  # a fault of ours must not stop a production line
-                self.complain(topic, error)
-                self.get_logger().error(f"internal fault on {topic}: {error!r}")
+                self.complain(topic.name, error)
+                self.get_logger().error(f"internal fault on {topic.name}: {error!r}")
 
         events = SubscriptionEventCallbacks(
-            message_lost=lambda event: self._count_lost(topic, event.total_count_change),
-            incompatible_qos=lambda event: self.get_logger().warning(
-                f"a publisher of {topic} offers an incompatible QoS; its messages do not come"
+            message_lost=lambda event: self._count_lost(topic.name, event.total_count_change),
+            incompatible_qos=lambda _: self.get_logger().warning(
+                f"a publisher of {topic.name} has an incompatible QoS; its messages do not arrive"
             ),
         )
-        return self.create_subscription(kind, topic, guarded, qos, event_callbacks=events)
+        kind, qos = interface_class(topic.msgtype), qos_profile(topic)
+        return self.create_subscription(kind, topic.name, guarded, qos, event_callbacks=events)
+
+    def client(self, service: Service) -> Any:
+        """Return a client whose answers arrive while other callbacks wait."""
+        kind = interface_class(service.kind)
+        return self.create_client(kind, service.name, callback_group=self.long_work)
+
+    def serve(self, service: Service, handle: Callable[[Any, Any], Any]) -> Any:
+        """Offer a service.
+
+        Parameters
+        ----------
+        service : Service
+            What.
+        handle : callable
+            Gets request and response, returns the response; may be a coroutine.
+        """
+        kind = interface_class(service.kind)
+        return self.create_service(kind, service.name, handle, callback_group=self.long_work)
+
+    def serve_action(self, action: Service, execute: Callable[[Any], Any]) -> ActionServer:
+        """Offer an action whose goals may be cancelled.
+
+        Parameters
+        ----------
+        action : Service
+            What.
+        execute : callable
+            Coroutine that gets the goal's handle and returns its result.
+        """
+        return ActionServer(
+            self, interface_class(action.kind), action.name, execute,
+            callback_group=self.long_work, cancel_callback=lambda _: CancelResponse.ACCEPT,
+        )  # fmt: skip
 
     def say(self, text: str) -> None:
         """Log a line, also from a thread that outlives the context by a moment."""

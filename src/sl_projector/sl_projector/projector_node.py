@@ -8,21 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sensor_msgs.msg import CameraInfo
-from sl_interfaces.msg import PatternTrigger, RigCalibration
-from sl_interfaces.srv import Project
-from std_srvs.srv import Trigger
+from sl_interfaces.msg import RigCalibration
 
-from sl_common.base_node import (
-    EVENTS,
-    LATCHED,
-    PROJECTOR_FRAME,
-    Health,
-    RigNode,
-    device_health,
-    next_scan_id,
-    run,
-)
+from sl_common import topics
+from sl_common.base_node import Health, RigNode, device_health, next_scan_id, run
 from sl_common.device_link import DeviceLink
 from sl_common.errors import (
     ConfigError,
@@ -101,13 +90,11 @@ class ProjectorNode(RigNode):
         self._calibrated_ns = 0
         self._last_run = time.monotonic()
         self._status: ProjectorStatus | None = None
-        self._triggers = self.create_publisher(PatternTrigger, "projector/trigger", EVENTS)
-        self._camera_info = self.create_publisher(CameraInfo, "projector/camera_info", LATCHED)
-        self.subscribe(RigCalibration, "calibration/rig", self._on_calibration, LATCHED)
-        self.create_service(
-            Project, "projector/project", self._project, callback_group=self.long_work
-        )
-        self.create_service(Trigger, "projector/stop", self._halt, callback_group=self.long_work)
+        self._triggers = self.advertise(topics.TRIGGER)
+        self._camera_info = self.advertise(topics.PROJECTOR_INFO)
+        self.listen(topics.CALIBRATION, self._on_calibration)
+        self.serve(topics.PROJECT, self._project)
+        self.serve(topics.STOP_PROJECTOR, self._halt)
         self._link = DeviceLink("projector", self._connect, self.say)
         self._link.start()
         self._poller = threading.Thread(target=self._poll, name="projector status", daemon=True)
@@ -220,7 +207,7 @@ class ProjectorNode(RigNode):
             return
         self._calibrated_ns = stamp_ns
         info = message.projector
-        info.header.frame_id = PROJECTOR_FRAME
+        info.header.frame_id = topics.PROJECTOR_FRAME
         info.header.stamp = message.header.stamp
         self._camera_info.publish(info)
 
@@ -299,7 +286,12 @@ class ProjectorNode(RigNode):
                 raise DeviceRefused("the projection was stopped")
             self._triggers.publish(
                 trigger_to_msg(
-                    sequence, index, scan_id, start_ns, info.timing.exposure_s, PROJECTOR_FRAME
+                    sequence,
+                    index,
+                    scan_id,
+                    start_ns,
+                    info.timing.exposure_s,
+                    topics.PROJECTOR_FRAME,
                 )
             )
         return len(sequence)

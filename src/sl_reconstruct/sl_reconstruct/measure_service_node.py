@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sl_interfaces.srv import Measure
 
+from sl_common import topics
 from sl_common.base_node import RigNode
 from sl_common.errors import SlError, StackError
 from sl_reconstruct.cloud.cloud_reader import read_cloud
@@ -27,14 +27,12 @@ class MeasureService:
     ----------
     node : RigNode
         Whose service this is; measuring runs in its workers.
-    group : CallbackGroup
-        In which requests arrive.
     """
 
-    def __init__(self, node: RigNode, group: Any) -> None:
+    def __init__(self, node: RigNode) -> None:
         self._node = node
         self._last: _Source | None = None
-        node.create_service(Measure, "measure", self._serve, callback_group=group)
+        node.serve(topics.MEASURE, self._serve)
 
     def remember(self, points: NDArray[Any], stamp_ns: int) -> None:
         """Take a cloud that was just published; it must not be written to any more."""

@@ -17,6 +17,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from sl_interfaces.msg import PatternStack, RefusalCount, RigCalibration, ScanReport
 
 from sl_common.errors import SequenceError, StackError
+from sl_common.topics import CAMERA_FRAME, PROJECTOR_FRAME, WORLD_FRAME
 from sl_projector.sequence.messages import sequence_from_msgs, stamp_from_msg, stamp_to_msg
 from sl_projector.sequence.pattern_sequence import PatternSequence
 from sl_reconstruct.cloud.cloud_writer import cloud_hash
@@ -224,9 +225,7 @@ def cloud_from_msg(message: PointCloud2) -> NDArray[Any]:
     return np.frombuffer(message.data, dtype).reshape(message.height, message.width)
 
 
-def rig_to_msg(
-    calibration: Calibration, source: str, stamp_ns: int, frames: tuple[str, str, str]
-) -> RigCalibration:
+def rig_to_msg(calibration: Calibration, source: str, stamp_ns: int) -> RigCalibration:
     """Return the calibration in force as a message.
 
     Parameters
@@ -237,21 +236,19 @@ def rig_to_msg(
         Where it was read from.
     stamp_ns : int
         When it came in force.
-    frames : tuple of str
-        Frame ids of world, camera and projector.
     """
     rig = calibration.rig
     message = RigCalibration(
         hash=calibration.hash,
         source=source,
         yaml=dump_calibration(calibration),
-        camera=camera_info(rig.camera, frames[1], stamp_ns),
-        projector=camera_info(rig.projector, frames[2], stamp_ns),
+        camera=camera_info(rig.camera, CAMERA_FRAME, stamp_ns),
+        projector=camera_info(rig.projector, PROJECTOR_FRAME, stamp_ns),
         camera_from_world=pose(rig.camera.rotation, rig.camera.translation_m),
         projector_from_world=pose(rig.projector.rotation, rig.projector.translation_m),
     )
     message.header.stamp = stamp_to_msg(stamp_ns)
-    message.header.frame_id = frames[0]
+    message.header.frame_id = WORLD_FRAME
     return message
 
 
@@ -283,12 +280,12 @@ def pose(rotation: Array, translation_m: Array) -> Pose:
     return message
 
 
-def frames_of(rig: Rig, frames: tuple[str, str, str]) -> list[TransformStamped]:
+def frames_of(rig: Rig) -> list[TransformStamped]:
     """Where camera and projector stand in the world, for tf: parent is the world."""
     transforms = []
-    for device, name in ((rig.camera, frames[1]), (rig.projector, frames[2])):
+    for device, name in ((rig.camera, CAMERA_FRAME), (rig.projector, PROJECTOR_FRAME)):
         transform = TransformStamped(child_frame_id=name)
-        transform.header.frame_id = frames[0]
+        transform.header.frame_id = WORLD_FRAME
         x, y, z = (float(v) for v in device.position_m)
         transform.transform.translation = Vector3(x=x, y=y, z=z)
         qx, qy, qz, qw = quaternion_xyzw(device.rotation.T)

@@ -7,6 +7,7 @@ from typing import Any
 from sl_interfaces.srv import Project
 from std_srvs.srv import Trigger
 
+from sl_common import topics
 from sl_common.base_node import RigNode
 from sl_reconstruct.scan.scan_flow import ScanFailed, ScanRequest, ScanWatch
 
@@ -18,18 +19,16 @@ class ProjectorClient:
     ----------
     node : RigNode
         Whose clients these are.
-    group : CallbackGroup
-        In which the answers arrive.
     """
 
-    def __init__(self, node: RigNode, group: Any) -> None:
-        self._project = node.create_client(Project, "projector/project", callback_group=group)
-        self._stop = node.create_client(Trigger, "projector/stop", callback_group=group)
+    def __init__(self, node: RigNode) -> None:
+        self._project = node.client(topics.PROJECT)
+        self._stop = node.client(topics.STOP_PROJECTOR)
 
     def gap(self) -> str:
         """Name what is missing before anything can be projected; empty when nothing is."""
         if not self._project.service_is_ready():
-            return "nobody offers projector/project: is the projector node running?"
+            return f"nobody offers {topics.PROJECT.name}: is the projector node running?"
         return ""
 
     def project(self, watch: ScanWatch, order: ScanRequest) -> None:

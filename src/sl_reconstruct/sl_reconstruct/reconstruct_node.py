@@ -17,25 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.action import ActionServer, CancelResponse
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import Image, PointCloud2
 from sl_interfaces.action import Scan
 from sl_interfaces.msg import MatchedFrame, PatternStack, RigCalibration, ScanReport
-from sl_interfaces.srv import Scan as ScanService
 
-from sl_common.base_node import (
-    CAMERA_FRAME,
-    EVENTS,
-    LARGE,
-    LATCHED,
-    PROJECTOR_FRAME,
-    WORLD_FRAME,
-    Health,
-    RigNode,
-    next_scan_id,
-    run,
-)
+from sl_common import topics
+from sl_common.base_node import Health, RigNode, next_scan_id, run
 from sl_common.errors import CalibrationError, ConfigError, SlError, StackError
 from sl_projector.sequence.messages import stamp_from_msg
 from sl_reconstruct.decode.settings import Settings
@@ -75,7 +62,6 @@ except ImportError:  # tf2 is not among the wheels; the poses are on calibration
 
 #: Stacks that may wait while one is being worked on; more would fill the memory.
 MAX_WAITING = 2
-FRAMES = (WORLD_FRAME, CAMERA_FRAME, PROJECTOR_FRAME)
 #: What most rigs do not need at once is compiled when the node has run so long: not in the first
 #: minutes, in which everybody waits for something else.
 REST_AFTER_S = 180.0
@@ -111,36 +97,26 @@ class ReconstructNode(RigNode):
         self._in_force_since_ns = 0
         self._calibration_fault = "no calibration yet"
         self._last = "no stack yet"
-        self._clouds = self.create_publisher(PointCloud2, "reconstruct/points", LARGE)
-        self._refusals = self.create_publisher(Image, "reconstruct/refusals", LARGE)
-        self._reports = self.create_publisher(ScanReport, "reconstruct/report", EVENTS)
-        self._rigs = self.create_publisher(RigCalibration, "calibration/rig", LATCHED)
-        self.latch_settings("reconstruct/settings")(self._workshop.settings.to_dict())
-        self._frames = (
-            self.create_publisher(TFMessage, "/tf_static", LATCHED) if TFMessage else None
-        )
-        self.subscribe(RigCalibration, "calibration/rig", self._on_rig, LATCHED)
-        self.subscribe(MatchedFrame, "synchronizer/frame", self._on_frame, EVENTS)
-        self.subscribe(PatternStack, "synchronizer/stack", self._on_stack, LARGE)
+        self._clouds = self.advertise(topics.POINTS)
+        self._refusals = self.advertise(topics.REFUSALS)
+        self._reports = self.advertise(topics.REPORT)
+        self._rigs = self.advertise(topics.CALIBRATION)
+        self.latch_settings(topics.SETTINGS)(self._workshop.settings.to_dict())
+        self._frames = self.advertise(topics.TF_STATIC) if TFMessage else None
+        self.listen(topics.CALIBRATION, self._on_rig)
+        self.listen(topics.FRAME, self._on_frame)
+        self.listen(topics.STACK, self._on_stack)
         self._offer_scan()
-        self._measuring = MeasureService(self, self.long_work)
+        self._measuring = MeasureService(self)
         self.add_on_set_parameters_callback(self._on_parameters)
         self._compiler = None if compiled() else compile_apart()
         self._worker.submit(self._warm_up)
         self._rest = self.create_timer(REST_AFTER_S, self._compile_rest, clock=self.steady)
 
     def _offer_scan(self) -> None:
-        group = self.long_work
-        self._projector = ProjectorClient(self, group)
-        self.create_service(ScanService, "scan", self._serve_scan, callback_group=group)
-        self._action = ActionServer(
-            self,
-            Scan,
-            "scan",
-            self._execute_scan,
-            callback_group=group,
-            cancel_callback=lambda _: CancelResponse.ACCEPT,
-        )
+        self._projector = ProjectorClient(self)
+        self.serve(topics.SCAN, self._serve_scan)
+        self._action = self.serve_action(topics.SCAN_ACTION, self._execute_scan)
 
     def _declare_parameters(self) -> None:
         self._file = self.declare("calibration_file", "", "calibration of the rig", live=True)
@@ -237,9 +213,9 @@ class ReconstructNode(RigNode):
         self._workshop.calibrate(calibration)
         self._in_force_since_ns = stamp_ns
         self._calibration_fault = ""
-        self._rigs.publish(rig_to_msg(calibration, source, stamp_ns, FRAMES))
+        self._rigs.publish(rig_to_msg(calibration, source, stamp_ns))
         if self._frames is not None:
-            self._frames.publish(TFMessage(transforms=frames_of(calibration.rig, FRAMES)))
+            self._frames.publish(TFMessage(transforms=frames_of(calibration.rig)))
         self.get_logger().info(f"calibration {calibration.hash[:12]} of {source} is in force")
 
     def _on_rig(self, message: RigCalibration) -> None:
@@ -247,10 +223,12 @@ class ReconstructNode(RigNode):
         stamp_ns = stamp_from_msg(message.header.stamp)
         if message.hash == self._workshop.calibration_hash or stamp_ns <= self._in_force_since_ns:
             return
-        calibration = parse_calibration(message.yaml, f"calibration/rig ({message.source})")
+        calibration = parse_calibration(
+            message.yaml, f"{topics.CALIBRATION.name} ({message.source})"
+        )
         if calibration.hash != message.hash:
             raise CalibrationError(
-                f"calibration/rig says hash {message.hash[:12]}, its document has "
+                f"{topics.CALIBRATION.name} says hash {message.hash[:12]}, its document has "
                 f"{calibration.hash[:12]}; expected the same"
             )
         self._put_in_force(calibration, message.source, stamp_ns)
@@ -316,11 +294,11 @@ class ReconstructNode(RigNode):
         try:
             report = self._reconstruct(stack, came_ns)
         except SlError as error:
-            self.complain("synchronizer/stack", error)
+            self.complain(topics.STACK.name, error)
             self._last = f"scan {stack.scan_id}: {error}"
             self._finish(stack.scan_id, error)
         except Exception as error:  # a fault of ours is the scan's answer, not the node's end
-            self.complain("synchronizer/stack", error)
+            self.complain(topics.STACK.name, error)
             self._finish(stack.scan_id, StackError(f"internal fault: {error!r}"))
         else:
             self._last = f"scan {stack.scan_id}: {report.points} points"
@@ -341,8 +319,8 @@ class ReconstructNode(RigNode):
         if not good:
             raise ScanFailed(f"no cloud is published: {'; '.join(reasons)}")
         stamp_ns = stack.stamps_ns[0]
-        self._refusals.publish(refusals_to_msg(product.cloud.reason, stamp_ns, CAMERA_FRAME))
-        self._clouds.publish(cloud_to_msg(product.cloud.points, stamp_ns, WORLD_FRAME))
+        self._refusals.publish(refusals_to_msg(product.cloud.reason, stamp_ns, topics.CAMERA_FRAME))
+        self._clouds.publish(cloud_to_msg(product.cloud.points, stamp_ns, topics.WORLD_FRAME))
         self._measuring.remember(product.cloud.points, stamp_ns)
         done_ns = time.time_ns()
         report = report_to_msg(product, stack)
@@ -440,9 +418,9 @@ class ReconstructNode(RigNode):
     def _gap(self) -> str:
         if gap := self._projector.gap():
             return gap
-        for topic, node in (("camera/image_raw", "camera"), ("synchronizer/stack", "synchronizer")):
-            if not self.count_publishers(topic):
-                return f"nobody publishes {topic}: is the {node} node running?"
+        for topic in (topics.IMAGE, topics.STACK):
+            if not self.count_publishers(topic.name):
+                return f"nobody publishes {topic.name}: is the {topic.node} node running?"
         if self._ready and not self._workshop.calibration_hash and not self._file:
             return (
                 "no calibration is in force: run 'slrig calibrate' or name a file (--calibration)"

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from sl_bringup.bag.bags import IMAGE, POSE, TRIGGER, Bag, Recorded
+from sl_bringup.bag.bags import Bag, Recorded
 from sl_camera.sync.matching import FrameDecision, StackMatcher
 from sl_camera.sync.message_fields import image_event, pose_event, trigger_event
 from sl_common.errors import SequenceError
+from sl_common.topics import IMAGE, POSE, TRIGGER
 
 #: At the end of a bag time passes until every scan has its verdict.
 END_NS = 3_600_000_000_000

@@ -27,27 +27,25 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import StoragePlugin, Writer
 from scipy.spatial.transform import Rotation
 
-from sl_bringup.bag.bags import (
-    CALIBRATION,
-    DEFAULT_NAMESPACE,
-    IMAGE,
-    POSE,
-    TRIGGER,
-    Topic,
-    message_class,
-    typestore,
-)
+from sl_bringup.bag.bags import message_class, typestore
 from sl_common.errors import BagError
+from sl_common.topics import (
+    CALIBRATION,
+    CAMERA_FRAME,
+    IMAGE,
+    NAMESPACE,
+    POSE,
+    PROJECTOR_FRAME,
+    TRIGGER,
+    WORLD_FRAME,
+    Topic,
+)
 from sl_projector.sequence.pattern_sequence import PatternSequence
 from sl_reconstruct.model.calibration_file import Calibration, dump_calibration
 from sl_reconstruct.model.opencv_lens import plumb_bob
 from sl_reconstruct.model.rig import Device
 
 Storage = Literal["mcap", "sqlite3"]
-
-CAMERA_FRAME = "sl_camera_optical"
-PROJECTOR_FRAME = "sl_projector_optical"
-WORLD_FRAME = "sl_world"
 
 #: A whole sequence fits (the longest named one has 50 patterns).
 QOS_DEPTH = 64
@@ -198,7 +196,7 @@ def _camera_info(device: Device, frame_id: str, stamp_ns: int) -> Any:
 def new_bag(
     path: str | Path,
     storage: Storage = "mcap",
-    namespace: str = DEFAULT_NAMESPACE,
+    namespace: str = NAMESPACE,
     notes: dict[str, str] | None = None,
 ) -> Iterator[BagWriter]:
     """Write a new rosbag2 directory; it appears under its name only when it is complete.

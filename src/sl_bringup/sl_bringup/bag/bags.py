@@ -1,4 +1,4 @@
-"""Recordings, without ROS: which topics matter, their types, and reading them robustly.
+"""Recordings read without ROS, as far as they are readable.
 
 rosbag2 directories, bare ``.mcap`` and ``.db3`` files are read, with or without
 ``metadata.yaml``. A damaged bag gives what is readable, and says what is lost.
@@ -27,50 +27,7 @@ from sl_bringup.bag.mcap_reader import NO_TYPE, McapFile
 from sl_bringup.bag.mcap_records import zstd
 from sl_bringup.bag.sqlite_salvage import SalvagedFile
 from sl_common.errors import BagError
-
-
-@dataclass(frozen=True)
-class Topic:
-    """One topic of the node graph that an evaluation needs.
-
-    Parameters
-    ----------
-    name : str
-        Below the rig's namespace.
-    msgtype : str
-        Its type.
-    latched : bool
-        Published once for all who come later (transient local).
-    """
-
-    name: str
-    msgtype: str
-    latched: bool = False
-
-
-TRIGGER = Topic("projector/trigger", "sl_interfaces/msg/PatternTrigger")
-IMAGE = Topic("camera/image_raw", "sensor_msgs/msg/Image")
-POSE = Topic("stage/pose", "geometry_msgs/msg/PoseStamped")
-CALIBRATION = Topic("calibration/rig", "sl_interfaces/msg/RigCalibration", latched=True)
-#: What an evaluation reads.
-TOPICS = (TRIGGER, IMAGE, POSE, CALIBRATION)
-
-CAMERA_INFO = Topic("camera/camera_info", "sensor_msgs/msg/CameraInfo")
-PROJECTOR_INFO = Topic("projector/camera_info", "sensor_msgs/msg/CameraInfo", latched=True)
-#: How the camera was set, and where its pixels end (JSON).
-CAMERA_SETTINGS = Topic("camera/settings", "std_msgs/msg/String", latched=True)
-#: What the live graph made of it: verdicts of the matching, results, settings.
-FRAME = Topic("synchronizer/frame", "sl_interfaces/msg/MatchedFrame")
-REPORT = Topic("reconstruct/report", "sl_interfaces/msg/ScanReport")
-#: JSON: what it takes to solve a calibration again.
-CALIBRATION_RUN = Topic("calibration/run", "std_msgs/msg/String")
-SETTINGS = Topic("reconstruct/settings", "std_msgs/msg/String", latched=True)
-MATCHING = Topic("synchronizer/settings", "std_msgs/msg/String", latched=True)
-#: What comes from the devices, and what `slrig record` records.
-RAW_TOPICS = (TRIGGER, IMAGE, CAMERA_INFO, POSE, CALIBRATION, PROJECTOR_INFO, CAMERA_SETTINGS)
-RECORDED_TOPICS = (*RAW_TOPICS, FRAME, REPORT, SETTINGS, MATCHING, CALIBRATION_RUN)
-
-DEFAULT_NAMESPACE = "/sl"
+from sl_common.topics import EVALUATED_TOPICS, IMAGE, NAMESPACE, TRIGGER, Topic
 
 
 def interface_dir() -> Path:
@@ -198,7 +155,7 @@ class Bag:
     _files: list[_File] = field(default_factory=list)
 
     def messages(self, *topics: Topic, quick: bool = False) -> Iterator[Recorded]:
-        """Yield the messages of the given topics (default: all of `TOPICS`) as recorded.
+        """Yield the messages of the given topics (default: what an evaluation reads) as recorded.
 
         Parameters
         ----------
@@ -216,7 +173,7 @@ class Bag:
         BagError
             When a topic has another type, or another version of it.
         """
-        for raw in self.raw(*topics or TOPICS, quick=quick):
+        for raw in self.raw(*topics or EVALUATED_TOPICS, quick=quick):
             try:
                 message = typestore().deserialize_cdr(raw.data, raw.topic.msgtype)
             except Exception as exc:
@@ -472,7 +429,7 @@ def _namespace(bag: Bag, wanted: str | None) -> str:
         raise BagError(
             f"{bag.path} has several rigs: {', '.join(found)}; expected one of them to be named"
         )
-    return found[0] if found else DEFAULT_NAMESPACE
+    return found[0] if found else NAMESPACE
 
 
 def topic_names(bag: Bag) -> list[str]:

@@ -6,9 +6,10 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 
-from sl_bringup.bag.bags import CALIBRATION, Bag, Recorded
+from sl_bringup.bag.bags import Bag, Recorded
 from sl_camera.sync.matching import MatchedStack
 from sl_common.errors import CalibrationError, SlError
+from sl_common.topics import CALIBRATION
 from sl_reconstruct.model.calibration_file import Calibration, load_calibration, parse_calibration
 
 

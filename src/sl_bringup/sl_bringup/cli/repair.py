@@ -12,10 +12,11 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, Qos
 
 from sl_bringup.bag.bag_recorder import BagRecorder
 from sl_bringup.bag.bag_writer import topic_qos
-from sl_bringup.bag.bags import Bag, Topic, open_bag
+from sl_bringup.bag.bags import Bag, open_bag
 from sl_bringup.graph.console import StatusLine, complain, say
 from sl_bringup.graph.version import software_version
 from sl_common.errors import BagError
+from sl_common.topics import Topic
 
 SHOW_S = 0.5
 

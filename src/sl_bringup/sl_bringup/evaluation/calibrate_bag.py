@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sl_bringup.bag.bag_matching import decisions
-from sl_bringup.bag.bags import CALIBRATION_RUN, Bag, open_bag
+from sl_bringup.bag.bags import Bag, open_bag
 from sl_bringup.bag.recorded_settings import read_settings
 from sl_calibration.data.run_store import OBSERVATIONS
 from sl_calibration.data.session import CalibrationRequest, Taken
@@ -25,6 +25,7 @@ from sl_calibration.workflow.calibrator import Pitches, made_from_order
 from sl_calibration.workflow.conclude import Outcome, conclude
 from sl_camera.sync.matching import MatchedStack, StackMatcher, Status
 from sl_common.errors import CalibrationError
+from sl_common.topics import CALIBRATION_RUN
 
 Look = Callable[[Taken, CalibrationRequest], View]
 Tell = Callable[[str], None]

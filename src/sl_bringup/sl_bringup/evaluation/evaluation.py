@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sl_bringup.bag.bag_matching import decisions
-from sl_bringup.bag.bags import TRIGGER, Bag, open_bag, topic_names
+from sl_bringup.bag.bags import Bag, open_bag, topic_names
 from sl_bringup.bag.recorded_calibrations import Calibrations, InForce
 from sl_bringup.bag.recorded_settings import read_settings
 from sl_bringup.evaluation.live_comparison import LiveResults
@@ -27,6 +27,7 @@ from sl_bringup.results.result_folder import clear_results, write_summary
 from sl_bringup.results.scan_files import write_scan
 from sl_camera.sync.matching import FrameDecision, MatchedStack, StackMatcher, Status
 from sl_common.errors import BagError, CalibrationError, SlError
+from sl_common.topics import TRIGGER
 from sl_reconstruct.cloud.cloud import Cloud, median
 from sl_reconstruct.cloud.cloud_writer import cloud_hash
 from sl_reconstruct.decode.full_scale import saturation_of

@@ -6,7 +6,8 @@ from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any
 
-from sl_bringup.bag.bags import REPORT, Bag
+from sl_bringup.bag.bags import Bag
+from sl_common.topics import REPORT
 
 
 class LiveResults:

@@ -12,8 +12,9 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from sl_bringup.graph.graph_config import NAMESPACE, runtime_directory
+from sl_bringup.graph.graph_config import runtime_directory
 from sl_bringup.graph.transport import Transport, process_environment
+from sl_common.topics import NAMESPACE
 
 
 def add_client_arguments(parser: argparse.ArgumentParser) -> None:

@@ -17,8 +17,8 @@ from typing import Any
 from sl_camera.camera.camera import PIXEL_BITS
 from sl_common.documents import dump_document, parse_document, read_text, write_text
 from sl_common.errors import ConfigError
+from sl_common.topics import NAMESPACE
 
-NAMESPACE = "/sl"
 BENCH = "/sl/bench"
 #: Every node with its module, in the order of the light.
 NODES = {

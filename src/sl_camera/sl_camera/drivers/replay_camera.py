@@ -21,9 +21,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from sl_camera.camera.camera import CameraSettings, CameraStatistics, Frame
 from sl_common.errors import DeviceError, DeviceLost, DeviceRefused
+from sl_common.topics import IMAGE
 
-TOPIC = "camera/image_raw"
-IMAGE_TYPE = "sensor_msgs/msg/Image"
 ENCODINGS: dict[str, np.dtype[Any]] = {"mono8": np.dtype(np.uint8), "mono16": np.dtype("<u2")}
 
 
@@ -73,7 +72,7 @@ class ReplayCamera:
         try:
             self._rewind()
             if self._next is None:
-                raise DeviceLost(f"{self._path} has no frames on {TOPIC}")
+                raise DeviceLost(f"{self._path} has no frames on {IMAGE.name}")
         except DeviceError:
             self.close()
             raise
@@ -181,10 +180,12 @@ class ReplayCamera:
 
 def _images(reader: AnyReader, path: Path) -> Iterator[NDArray[Any]]:
     """Yield the pixels of every image, in order; a DeviceError where one cannot be used."""
-    topics = sorted({c.topic for c in reader.connections if c.topic.endswith("/" + TOPIC)})
+    topics = sorted({c.topic for c in reader.connections if c.topic.endswith("/" + IMAGE.name)})
     if len(topics) > 1:
         raise DeviceError(f"{path} has several cameras: {', '.join(topics)}; expected one")
-    connections = [c for c in reader.connections if c.topic in topics and c.msgtype == IMAGE_TYPE]
+    connections = [
+        c for c in reader.connections if c.topic in topics and c.msgtype == IMAGE.msgtype
+    ]
     if not connections:
         return
     messages = reader.messages(connections)

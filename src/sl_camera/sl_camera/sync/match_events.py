@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sl_common.errors import ConfigError
+from sl_common.topics import WORLD_FRAME
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence
 
 Pixels: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
@@ -131,7 +132,7 @@ class PoseEvent:
     stamp_ns: int
     position_m: tuple[float, float, float]
     quaternion_xyzw: tuple[float, float, float, float]
-    frame_id: str = "sl_world"
+    frame_id: str = WORLD_FRAME
 
     def fault(self) -> str:
         """Say why this is not a pose; empty when it is one."""
