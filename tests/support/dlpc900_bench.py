@@ -2,15 +2,19 @@
 
 from dataclasses import dataclass, field
 
+import numpy as np
 import usb.core
 
 from sl_bench.dlpc.dlpc900_emulator import Dlpc900Emulator
 from sl_bench.dlpc.dlpc900_sequencer import VirtualClock
 from sl_bench.dlpc.usb_server import EmulatedUsb
 from sl_projector.dlpc.dlpc900_driver import Dlpc900, Dlpc900Settings
+from sl_projector.dlpc.dmd import Timing
 from sl_projector.hid.usb_socket import LinkBackend
 
 REPLY_TIMEOUT_S = 0.3
+FAST = Timing(1e-3)
+START = 0x1A24
 
 
 @dataclass
@@ -65,6 +69,21 @@ class Bench:
             clock=self.clock,
         )
 
+    def run_and_wait(self, sequence, timing=FAST, repeats=1):
+        """Load and run a sequence to its end; exposures are in ``edges`` afterwards."""
+        self.edges.clear()
+        self.driver.load(sequence, timing)
+        info = self.driver.run(timing, repeats)
+        # Waiting moves the virtual clock, so it may be far ahead of an emulator that is busy.
+        self.driver.wait(timeout_s=1e6)
+        return info
+
+    def assert_shown(self, sequence):
+        """Each pattern was shown once, in order, mirror for mirror."""
+        assert [index for _, index, _, _ in self.edges] == list(range(len(sequence)))
+        for mirrors, index, _, _ in self.edges:
+            np.testing.assert_array_equal(mirrors, sequence.frame(index) == 255)
+
     def _edge(self, mirrors, index, start_ns, exposure_s):
         self.edges.append((mirrors, index, start_ns, exposure_s))
 
@@ -72,3 +91,11 @@ class Bench:
         """Return the device as a foreign host program finds it."""
         backend = LinkBackend(self.bus.connect())
         return usb.core.find(idVendor=0x0451, idProduct=0xC900, backend=backend)
+
+
+def open_bench():
+    """An emulated DLP5500 with its driver open."""
+    made = Bench()
+    made.driver.open()
+    yield made
+    made.driver.close()
