@@ -40,6 +40,7 @@ from sl_projector.dlpc.dmd import Timing
 from sl_projector.sequence.pattern_sequence import named
 from sl_reconstruct.model.calibration_file import load_calibration, rig_hash
 from support.paths import ROOT
+from support.patience import Deadline, patience
 
 CONFIG = """
 /sl/bench:
@@ -69,13 +70,13 @@ def start(directory: Path, config: str = CONFIG) -> subprocess.Popen[str]:
     )  # fmt: skip
     assert process.stdout is not None
     line = process.stdout.readline()
-    assert line == "bench ready\n", process.communicate(timeout=READY_S)
+    assert line == "bench ready\n", process.communicate(timeout=patience(READY_S))
     return process
 
 
 def end(process: subprocess.Popen[str], number: int, directory: Path) -> None:
     process.send_signal(number)
-    out, err = process.communicate(timeout=30.0)
+    out, err = process.communicate(timeout=patience(30.0))
     assert (process.returncode, out, err) == (0, "", "")
     assert list((directory / "run").iterdir()) == []
 
@@ -247,8 +248,8 @@ def test_camera_unplugged_in_use(devices: Devices) -> None:
     with pytest.raises(DeviceLost):
         for _ in range(100):
             devices.camera.read(0.05)
-    deadline = time.monotonic() + 60.0
-    while time.monotonic() < deadline and devices.camera.statistics().reconnects == 0:
+    deadline = Deadline(60.0)
+    while not deadline.is_over and devices.camera.statistics().reconnects == 0:
         try:
             devices.camera.read(0.05)
         except DeviceLost:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from sl_bringup.cli.main import COMMANDS, build_parser, main
+from support.patience import patience
 
 OFFLINE = ("patterns", "import", "evaluate")
 
@@ -85,7 +86,7 @@ def test_offline_commands_import_no_ros(command: str) -> None:
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True,
-        env={"PYTHONPATH": ":".join(sys.path)}, timeout=120,
+        env={"PYTHONPATH": ":".join(sys.path)}, timeout=patience(120.0),
     )  # fmt: skip
     assert done.stdout.strip() == "[]"
 
@@ -97,7 +98,7 @@ def test_help_imports_nothing_heavy() -> None:
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True,
-        env={"PYTHONPATH": ":".join(sys.path)}, timeout=120,
+        env={"PYTHONPATH": ":".join(sys.path)}, timeout=patience(120.0),
     )  # fmt: skip
     assert done.stdout.strip() == "[]"
 

@@ -6,7 +6,6 @@ import asyncio
 import os
 import signal
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from sl_bringup.graph.graph import is_running, lock_directory
 from sl_bringup.graph.graph_config import NODES, Changes, find_config, started_nodes, write_config
 from sl_bringup.graph.supervisor import Process, Supervisor, Timing
 from sl_common.errors import ConfigError
+from support.patience import Deadline
 from support.processes import wait_until_ended
 
 QUICK = Timing(backoff_s=0.05, backoff_limit_s=0.2, interrupt_s=0.5, terminate_s=0.5)
@@ -54,10 +54,10 @@ class Told:
         return sum(text in line for line in self.lines)
 
 
-async def until(condition: Callable[[], bool], patience_s: float = 10.0) -> None:
-    end_s = time.monotonic() + patience_s
+async def until(condition: Callable[[], bool]) -> None:
+    deadline = Deadline()
     while not condition():
-        assert time.monotonic() < end_s, "what was waited for did not happen"
+        assert not deadline.is_over, "what was waited for did not happen"
         await asyncio.sleep(0.01)
 
 

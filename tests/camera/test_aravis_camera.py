@@ -21,6 +21,7 @@ from sl_camera.drivers.aravis_camera import AravisCamera, AravisOptions
 from sl_camera.drivers.aravis_library import list_cameras, load_aravis
 from sl_common.errors import DeviceError, DeviceLost, DeviceRefused
 from support.camera_bench import HEIGHT, SERIAL, WIDTH, fake_gige, gige_bench, require_gi
+from support.patience import Deadline
 
 EXPOSURE_S = 0.003
 MIRRORS = np.ones((2, 2), np.bool_)
@@ -29,8 +30,8 @@ SMALL = CameraSettings(exposure_s=EXPOSURE_S, trigger="software", region=(0, 0, 
 
 def read(camera: CameraDriver, most: int, patience_s: float = 2.0) -> list[Frame]:
     frames: list[Frame] = []
-    deadline = time.monotonic() + patience_s
-    while len(frames) < most and time.monotonic() < deadline:
+    deadline = Deadline(patience_s)
+    while len(frames) < most and not deadline.is_over:
         if (frame := camera.read(0.1)) is not None:
             frames.append(frame)
     return frames
@@ -271,9 +272,9 @@ def test_an_unplugged_camera_comes_back_as_it_was(wired: Wired) -> None:
     with pytest.raises(DeviceLost):
         for _ in itertools.repeat(None, 100):
             wired.camera.read(0.1)
-    deadline = time.monotonic() + 15.0
+    deadline = Deadline(15.0)
     while wired.camera.statistics().reconnects == 0:
-        assert time.monotonic() < deadline
+        assert not deadline.is_over
         try:
             wired.camera.read(0.1)
         except DeviceLost:

@@ -17,6 +17,7 @@ import pytest
 from sl_camera.camera.camera import CameraDriver, CameraSettings, Frame, FrameStatus
 from sl_common.errors import DeviceError, DeviceRefused
 from support.camera_bench import KINDS, Made, real
+from support.patience import Deadline
 
 HARDWARE = "camera="
 EXPOSURE_S = 0.004
@@ -57,8 +58,8 @@ def settings(made: Made, **changes: object) -> CameraSettings:
 def take(camera: CameraDriver, patience_s: float = 2.0) -> Frame:
     """Trigger one frame and wait for it."""
     camera.software_trigger()
-    deadline = time.monotonic() + patience_s
-    while time.monotonic() < deadline:
+    deadline = Deadline(patience_s)
+    while not deadline.is_over:
         if (frame := camera.read(0.1)) is not None:
             return frame
     pytest.fail("no frame after a software trigger")
@@ -121,8 +122,8 @@ def test_disarmed_it_delivers_nothing_new(camera: CameraDriver) -> None:
 def test_free_run_delivers_in_order(made: Made) -> None:
     made.driver.configure(settings(made, trigger="free"))
     made.driver.arm()
-    deadline, stamps = time.monotonic() + 5.0, []
-    while len(stamps) < 5 and time.monotonic() < deadline:
+    deadline, stamps = Deadline(5.0), []
+    while len(stamps) < 5 and not deadline.is_over:
         if (frame := made.driver.read(0.2)) is not None:
             stamps.append(frame.stamp_ns)
     assert len(stamps) == 5

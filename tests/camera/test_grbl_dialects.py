@@ -12,7 +12,8 @@ from sl_bench.stage.grbl_emulator import GrblEmulator
 from sl_camera.stage.grbl.grbl_protocol import is_supported, parse_setting
 from sl_camera.stage.grbl.grbl_stage import GrblStage
 from sl_common.errors import DeviceError, DeviceRefused, DeviceTimeout
-from support.stage_bench import Clock, Mover, until
+from support.patience import wait
+from support.stage_bench import Clock, Mover
 
 Change = Callable[[bytes, bytes], bytes]
 
@@ -100,7 +101,7 @@ def test_connect_move_hold_resume_alarm_unlock_reset(name: str) -> None:
 
         emulator.clock.run_at(0.1)  # nothing is over before it was seen to go on
         stage.jog_by(0.01, 0.0, 0.0, speed_m_s=0.005)
-        until(lambda: stage.state().kind == "moving")
+        wait(lambda: stage.state().kind == "moving", "the stage")
         stage.hold()  # ends a jog
         assert stage.state().kind == "idle"
         stage.jog_by(0.005, 0.0, 0.0, speed_m_s=0.005)
@@ -116,7 +117,7 @@ def test_connect_move_hold_resume_alarm_unlock_reset(name: str) -> None:
         with pytest.raises(DeviceRefused, match="soft limit"):
             stage.move_to(low[0] - 0.001, 0.0, 0.0)
         emulator.alarm(1)
-        until(lambda: stage.state().kind == "alarm")
+        wait(lambda: stage.state().kind == "alarm", "the stage")
         with pytest.raises(DeviceRefused, match="limit switch"):
             stage.move_to(0.0, 0.0, 0.0)
         stage.clear()
@@ -132,7 +133,7 @@ def test_every_alarm_is_named_and_cleared(code: int) -> None:
         stage.open()
         stage.home()
         emulator.alarm(code)
-        until(lambda: stage.state().kind == "alarm")
+        wait(lambda: stage.state().kind == "alarm", "the stage")
         assert f"ALARM:{code}: " in stage.state().text
         assert "not known" not in stage.state().text
         stage.clear()

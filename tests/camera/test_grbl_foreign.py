@@ -19,7 +19,8 @@ from sl_camera.stage.grbl.grbl_conversation import GrblConversation
 from sl_camera.stage.grbl.grbl_protocol import machine_frame, parse_report
 from sl_camera.stage.grbl.grbl_stage import GrblStage
 from sl_common.errors import DeviceError, DeviceRefused
-from support.stage_bench import Clock, Mover, until
+from support.patience import wait
+from support.stage_bench import Clock, Mover
 
 Change = Callable[[bytes, bytes], bytes]
 
@@ -65,7 +66,7 @@ def under_way(odd: Odd, stage: GrblStage, x_m: float) -> Mover:
     """A move that the carriage has begun."""
     start = odd.position_m()
     mover = Mover(stage, x_m, 0.0, 0.0)
-    until(lambda: odd.position_m() != start, timeout_s=30.0)
+    wait(lambda: odd.position_m() != start, "the stage")
     return mover
 
 
@@ -75,7 +76,7 @@ def test_words_are_apart_and_jogs_relative(odd: Odd, stage: GrblStage) -> None:
     stage.jog_by(0.0005, 0.0, -0.00025, speed_m_s=0.01)
     assert b"G0 G53 G21 G90 G94 X-24.0000 Y-25.0000 Z-10.0000\n" in odd.heard
     assert b"$J=G91 G21 X0.5000 Y0.0000 Z-0.2500 F600.0\n" in odd.heard
-    until(lambda: stage.state().kind == "idle", timeout_s=30.0)
+    wait(lambda: stage.state().kind == "idle", "the stage")
     assert stage.position_m() == pytest.approx((0.0015, 0.0, -0.00025), abs=1e-6)
 
 
@@ -147,7 +148,7 @@ def test_stopped_after_the_dwell_was_answered(odd: Odd, stage: GrblStage) -> Non
     odd.change = lambda _, sent: re.sub(rb"error:\d+", b"ok", sent)
     odd.clock.run_at(0.1)
     mover = under_way(odd, stage, 0.024)
-    until(lambda: b"G4 P" in odd.heard, timeout_s=30.0)
+    wait(lambda: b"G4 P" in odd.heard, "the stage")
     stage.stop()
     assert stage.state().kind == "idle"
     assert "the controller was stopped" in str(mover.ended())
@@ -161,7 +162,7 @@ def test_an_alarm_without_its_line(odd: Odd, stage: GrblStage) -> None:
     odd.change = lambda _, sent: re.sub(rb"ALARM:\d\r\n", b"", sent)
     mover = under_way(odd, stage, 0.02)
     # the dwell has been read, else it is refused
-    until(lambda: odd.heard.rfind(b"?") > odd.heard.find(b"G4 P0.01\n") >= 0, timeout_s=30.0)
+    wait(lambda: odd.heard.rfind(b"?") > odd.heard.find(b"G4 P0.01\n") >= 0, "the stage")
     odd.alarm(3)
     assert "did not say why" in str(mover.ended())
     state = stage.state()
@@ -227,7 +228,7 @@ def test_the_banner_of_a_repeated_reset_is_no_power_cycle(odd: Odd, stage: GrblS
 
     odd.change = delayed
     odd.alarm(2)
-    until(lambda: stage.state().kind == "alarm", timeout_s=30.0)
+    wait(lambda: stage.state().kind == "alarm", "the stage")
     stage.clear()
     assert odd.heard.count(b"\x18") > 1
     assert stage.state().kind == "idle"

@@ -16,7 +16,8 @@ from sl_camera.stage.manual_stage import ManualStage
 from sl_camera.stage.zaber.zaber_protocol import checksum, command, parse_reply
 from sl_camera.stage.zaber.zaber_stage import ZaberStage, zaber_axes
 from sl_common.errors import ConfigError, DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
-from support.stage_bench import Clock, Mover, until
+from support.patience import wait
+from support.stage_bench import Clock, Mover
 
 
 class Rig:
@@ -128,7 +129,7 @@ def test_alarm_in_motion(rig: Rig) -> None:
 
 def test_limit_switch_names_itself_and_stays_until_cleared(rig: Rig) -> None:
     rig.emulator.close_switch(2)
-    until(lambda: rig.stage.state().kind == "alarm")
+    wait(lambda: rig.stage.state().kind == "alarm", "the stage")
     assert "limit switch" in rig.stage.state().text
     with pytest.raises(DeviceRefused, match="limit switch"):
         rig.stage.move_to(0.0, 0.0, 0.0)
@@ -165,7 +166,7 @@ def test_power_cycle_is_noticed_and_costs_the_reference(rig: Rig, moving: bool) 
         rig.clock.run_at(2.0)
         mover = Mover(rig.stage, 0.02, 0.0, 0.0)
     rig.emulator.power_cycle()
-    until(lambda: rig.stage.state().kind == "alarm")
+    wait(lambda: rig.stage.state().kind == "alarm", "the stage")
     if moving:
         assert "restarted" in str(mover.ended())
     assert "restarted" in rig.stage.state().text
@@ -185,7 +186,7 @@ def test_unplugged_and_plugged_again(rig: Rig, moving: bool) -> None:
         rig.clock.run_at(2.0)
         mover = Mover(rig.stage, 0.02, 0.0, 0.0)
     rig.emulator.disconnect()
-    until(lambda: rig.stage.state().kind == "lost")
+    wait(lambda: rig.stage.state().kind == "lost", "the stage")
     if moving:
         assert isinstance(mover.ended(), DeviceLost)
     with pytest.raises(DeviceLost):
@@ -288,7 +289,7 @@ def test_zaber_emergency_stop_stays_until_released(
     mover = Mover(stage, 0.02, 0.02, 0.0)
     emulator.fault(1, "FH", stays=True)
     assert "emergency stop" in str(mover.ended())
-    until(lambda: not any(device.busy for device in emulator.devices))
+    wait(lambda: not any(device.busy for device in emulator.devices), "the stage")
     with pytest.raises(DeviceRefused, match="still there"):
         stage.clear()
     emulator.release()
@@ -378,7 +379,10 @@ def test_the_emulator_remembers_where_the_carriage_stood(rig: Rig) -> None:
     before_ns = time.time_ns()
     mover = Mover(rig.stage, 0.002, 0.0, 0.0)
     assert mover.ended() is None
-    until(lambda: rig.emulator.position_at(time.time_ns())[0] == pytest.approx(0.002, abs=1e-9))
+    wait(
+        lambda: rig.emulator.position_at(time.time_ns())[0] == pytest.approx(0.002, abs=1e-9),
+        "the stage",
+    )
     after_ns = time.time_ns()
     assert rig.emulator.position_at(before_ns)[0] == 0.0
     times_ns = [before_ns + i * (after_ns - before_ns) // 50 for i in range(51)]

@@ -9,6 +9,7 @@ import pytest
 
 from sl_common.device_link import DeviceLink
 from sl_common.errors import DeviceLost
+from support.patience import Deadline
 
 
 class Thing:
@@ -37,9 +38,9 @@ class Plug:
 
 
 def wait(done: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 10
+    deadline = Deadline()
     while not done():
-        assert time.monotonic() < deadline, "nothing happened in 10 s"
+        assert not deadline.is_over, "nothing happened"
         time.sleep(0.005)
 
 

@@ -27,7 +27,8 @@ from sl_bringup.graph.transport import Transport, process_environment  # noqa: E
 from sl_calibration.verify.verification import triangulate  # noqa: E402
 from sl_common import topics  # noqa: E402
 from sl_reconstruct.model.calibration_file import load_rig, parse_calibration, rig_hash  # noqa: E402
-from support.ros_graph import Graph, wait  # noqa: E402
+from support.patience import PATIENCE_S, patience, wait  # noqa: E402
+from support.ros_graph import Graph  # noqa: E402
 
 NODES = {
     "projector": ("sl_projector.projector_node", "device:=socket:{}/usb.sock"),
@@ -108,7 +109,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
                 process.send_signal(signal.SIGINT)
             for process in processes.values():
                 try:
-                    process.wait(timeout=20)
+                    process.wait(timeout=patience(20.0))
                 except subprocess.TimeoutExpired:
                     process.kill()
 
@@ -196,7 +197,7 @@ def test_a_dark_lamp_is_refused_and_the_old_calibration_stays(
 def test_a_run_can_be_cancelled_half_way(running: Running, calibrated: Calibrate.Response) -> None:
     told: list[CalibrateAction.Feedback] = []
     client = running.graph.tester.action_client(topics.CALIBRATE_ACTION)
-    assert client.wait_for_server(ros_graph.PATIENCE_S)
+    assert client.wait_for_server(patience(PATIENCE_S))
     goal = CalibrateAction.Goal(heights_m=HEIGHTS_M)
     sent = client.send_goal_async(goal, lambda m: told.append(m.feedback))
     wait(sent.done, "the goal to be accepted")

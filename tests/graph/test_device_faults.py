@@ -7,7 +7,6 @@ The table of `docs/faults.md`; the drivers' own tests go deeper (`test_dlpc900_d
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import pytest
 
 from support import ros_graph
+from support.patience import Deadline
 
 ros_graph.require_ros()
 
@@ -24,7 +24,7 @@ from sl_bench.camera.camera_faults import CameraFaults  # noqa: E402
 from sl_common import topics  # noqa: E402
 from support import fault_cell  # noqa: E402
 from support.fault_cell import Cell  # noqa: E402
-from support.ros_graph import wait  # noqa: E402
+from support.patience import wait  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,7 @@ SPOILING = [
 
 @pytest.mark.parametrize("case", SPOILING, ids=lambda case: case.name)
 def test_a_fault_that_spoils_is_told_and_mended_without_a_restart(cell: Cell, case: Case) -> None:
-    deadline_s = time.monotonic() + fault_cell.PATIENCE_S
+    deadline = Deadline(fault_cell.PATIENCE_S)
     while True:
         cell.diagnostics.clear()
         case.ask(cell)
@@ -117,7 +117,7 @@ def test_a_fault_that_spoils_is_told_and_mended_without_a_restart(cell: Cell, ca
         if not said_otherwise:
             return
         # A machine that is too slow for the exposures spoils scans by itself, in its own way.
-        assert time.monotonic() < deadline_s, said_otherwise
+        assert not deadline.is_over, said_otherwise
 
 
 BORNE = [
@@ -208,7 +208,7 @@ def stage_fault(
     cell: Cell, ask: Callable[[Cell], object], words: str, mend: Callable[[Cell], object] | None
 ) -> None:
     """Fail at the start of a move; afterwards the same move works, and ends where it was sent."""
-    deadline_s = time.monotonic() + fault_cell.PATIENCE_S
+    deadline = Deadline(fault_cell.PATIENCE_S)
     while True:
         cell.diagnostics.clear()
         ask(cell)
@@ -218,7 +218,7 @@ def stage_fault(
             break
         # The noise was before an answer to nobody but the pose.
         assert cell.move(0.0).success, said_otherwise
-        assert time.monotonic() < deadline_s, said_otherwise
+        assert not deadline.is_over, said_otherwise
     # The scan is refused or rightly matched: the part stands.
     cell.project()
     cell.check_stacks()

@@ -26,7 +26,8 @@ from sl_common import topics  # noqa: E402
 from sl_reconstruct.cloud.cloud_writer import cloud_hash  # noqa: E402
 from sl_reconstruct.messages import cloud_from_msg  # noqa: E402
 from sl_reconstruct.model.calibration_file import rig_hash, save_calibration  # noqa: E402
-from support.ros_graph import Graph, wait  # noqa: E402
+from support.patience import patience, wait  # noqa: E402
+from support.ros_graph import Graph  # noqa: E402
 
 #: Where the stage puts the plate; a whole number of the emulated stage's steps.
 HEIGHT_M = 0.2e-3
@@ -51,9 +52,11 @@ class Running:
         for name, process in self.processes.items():
             if name != "bench":
                 process.send_signal(signal.SIGINT)
-        codes = {n: p.wait(timeout=20) for n, p in self.processes.items() if n != "bench"}
+        codes = {
+            n: p.wait(timeout=patience(20.0)) for n, p in self.processes.items() if n != "bench"
+        }
         self.processes["bench"].send_signal(signal.SIGINT)
-        return {**codes, "bench": self.processes["bench"].wait(timeout=20)}
+        return {**codes, "bench": self.processes["bench"].wait(timeout=patience(20.0))}
 
 
 def start(directory: Path, domain: int) -> dict[str, subprocess.Popen[bytes]]:
@@ -88,7 +91,7 @@ def running(tmp_path: Path) -> Iterator[Running]:
             for process in processes.values():
                 if process.poll() is None:
                     process.kill()
-                process.wait(timeout=20)
+                process.wait(timeout=patience(20.0))
 
 
 def test_one_scan_from_trigger_to_cloud_and_a_clean_end(running: Running) -> None:

@@ -47,7 +47,8 @@ from sl_reconstruct.messages import cloud_from_msg, refusals_from_msg  # noqa: E
 from sl_reconstruct.model.calibration_file import dump_calibration, rig_hash, save_calibration  # noqa: E402
 from sl_reconstruct.reconstruct_node import ReconstructNode  # noqa: E402
 from support.fake_devices import FakeCamera, FakeProjector, FakeStage, WiredPair  # noqa: E402
-from support.ros_graph import Graph, wait  # noqa: E402
+from support.patience import PATIENCE_S, patience, wait  # noqa: E402
+from support.ros_graph import Graph  # noqa: E402
 from support.tiny_scans import HEIGHT_M, SLOPE, render, tiny_rig, tiny_sequence  # noqa: E402
 
 SEQUENCE = tiny_sequence("precise")
@@ -797,7 +798,7 @@ def test_the_action_tells_progress_and_a_second_scan_is_refused(rig: Rig) -> Non
     rig.clouds.clear()
     told: list[ScanAction.Feedback] = []
     client = rig.graph.tester.action_client(topics.SCAN_ACTION)
-    assert client.wait_for_server(ros_graph.PATIENCE_S)
+    assert client.wait_for_server(patience(PATIENCE_S))
     goal = ScanAction.Goal(sequence="precise", max_repeats=255)
     sent = client.send_goal_async(goal, lambda m: told.append(m.feedback))
     wait(sent.done, "the goal to be accepted")
@@ -815,7 +816,7 @@ def test_the_action_tells_progress_and_a_second_scan_is_refused(rig: Rig) -> Non
 
 def test_a_scan_can_be_cancelled_and_the_next_one_is_right(rig: Rig) -> None:
     client = rig.graph.tester.action_client(topics.SCAN_ACTION)
-    assert client.wait_for_server(ros_graph.PATIENCE_S)
+    assert client.wait_for_server(patience(PATIENCE_S))
     goal = ScanAction.Goal(sequence="precise", exposure_s=10.0, max_repeats=0)
     sent = client.send_goal_async(goal)
     wait(sent.done, "the goal to be accepted")

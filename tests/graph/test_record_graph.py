@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 from rosbags.highlevel import AnyReader
 
+from support.patience import wait
 from support.ros_graph import graph as ros_graph
-from support.ros_graph import require_ros, wait
+from support.ros_graph import require_ros
 
 require_ros()
 

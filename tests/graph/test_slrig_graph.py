@@ -19,6 +19,7 @@ from sl_bringup.graph.graph_config import NODES
 from sl_bringup.graph.transport import process_environment
 from support.domains import ReservedDomain
 from support.paths import ROOT
+from support.patience import Deadline, patience
 from support.processes import wait_until_ended
 
 SOAK = ROOT / "benchmarks" / "soak_faults.py"
@@ -51,17 +52,17 @@ class Command:
         return "\n".join(self.lines)
 
     def wait_for(self, text: str, patience_s: float, times: int = 1) -> None:
-        end_s = time.monotonic() + patience_s
+        deadline = Deadline(patience_s)
         while self.text.count(text) < times:
             assert self._process.poll() is None, f"ended before it said {text!r}:\n{self.text}"
-            assert time.monotonic() < end_s, f"did not say {text!r}:\n{self.text}"
+            assert not deadline.is_over, f"did not say {text!r}:\n{self.text}"
             time.sleep(0.05)
 
     def end(self, number: signal.Signals | None = None, patience_s: float = 60.0) -> int:
         if number:
             self._process.send_signal(number)
         try:
-            return self._process.wait(patience_s)
+            return self._process.wait(patience(patience_s))
         finally:
             self._process.kill()
             self._process.wait()
@@ -145,7 +146,7 @@ def test_scans_with_devices_that_fail_at_random(graph: Command, ros_domain: int)
         [sys.executable, str(SOAK), "--attach", "--domain", f"{ros_domain}", "--scans", "8",
          "--seed", "64", "--sequences", "paper"],
         env=process_environment({"PYTHONPATH": os.pathsep.join(sys.path)}),
-        capture_output=True, text=True, timeout=600.0, check=False,
+        capture_output=True, text=True, timeout=patience(600.0), check=False,
     )  # fmt: skip
     assert soak.returncode == 0, soak.stdout + soak.stderr
     figures = json.loads(soak.stdout[soak.stdout.index("{") :])

@@ -27,7 +27,7 @@ from sl_projector.dlpc.dmd import Timing, TriggerIn, TriggerOut, dmd_model
 from sl_projector.hid.usb_socket import LinkBackend
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence, named
 from support.dlpc900_bench import Recorder
-from support.stage_bench import until
+from support.patience import wait
 
 SIZE = dmd_model("DLP4500").size
 TIMING = Timing(2e-3, 500e-6)
@@ -233,8 +233,8 @@ def test_patterns_wait_for_the_trigger_input(
     assert all(word >> 17 & 1 for word in words)
     for shown, kind in enumerate(kinds):
         if kind in (1, 2):
-            until(lambda: bench.emulator.trigger_in(bench.clock.now_ns()), 60.0)
-        until(lambda wanted=shown + 1: len(bench.edges) >= wanted, 60.0)
+            wait(lambda: bench.emulator.trigger_in(bench.clock.now_ns()), "the exposure", 60.0)
+        wait(lambda wanted=shown + 1: len(bench.edges) >= wanted, "the exposure", 60.0)
     bench.driver.wait(timeout_s=1e6)
     assert [np.array_equal(e[0], some.frame(i % 3) > 0) for i, e in enumerate(bench.edges)] == (
         [True] * 6

@@ -12,6 +12,7 @@ from sl_projector.dlpc.dlpc900_driver import Dlpc900Settings
 from sl_projector.dlpc.dmd import Timing, TriggerIn, TriggerOut, dmd_model
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence, named
 from support.dlpc900_bench import FAST, START, Bench, open_bench
+from support.patience import patience
 
 
 @pytest.fixture
@@ -194,9 +195,9 @@ def test_external_trigger_advances_one_pattern_an_edge():
         edge_ns = bench.clock.now_ns()
         while not bench.emulator.trigger_in(edge_ns):
             edge_ns = bench.clock.now_ns()
-        assert shown.acquire(timeout=10)
+        assert shown.acquire(timeout=patience(10.0))
         assert bench.edges[-1][2] == edge_ns + 200_000
-    bench.driver.wait(timeout_s=10)
+    bench.driver.wait(timeout_s=patience(10.0))
     bench.assert_shown(sequence)
     bench.driver.close()
 
@@ -219,8 +220,8 @@ def test_external_trigger_of_the_first_pattern_only():
             edge_ns = bench.clock.now_ns()
         edges_ns.append(edge_ns)
         for _ in sequence.patterns:  # one edge shows them all
-            assert shown.acquire(timeout=60)
-    bench.driver.wait(timeout_s=60)
+            assert shown.acquire(timeout=patience(60.0))
+    bench.driver.wait(timeout_s=patience(60.0))
     count = len(sequence)
     starts = [
         edge + 200_000 + i * FAST.exposure_us * 1000 for edge in edges_ns for i in range(count)

@@ -39,7 +39,8 @@ from sl_projector.hid.usb_socket import LinkBackend
 from sl_projector.projector_node import ProjectorNode
 from sl_projector.sequence.pattern_sequence import named
 from support import ros_graph
-from support.ros_graph import Graph, wait
+from support.patience import Deadline, wait
+from support.ros_graph import Graph
 from support.stage_bench import Clock
 
 PAPER = named("paper")
@@ -145,8 +146,8 @@ class Cell:
 
     def told(self, words: str, timeout_s: float = PATIENCE_S) -> str:
         """Wait until `/diagnostics` warns in these words; return what it said if it never does."""
-        end_s = time.monotonic() + timeout_s
-        while time.monotonic() < end_s:
+        deadline = Deadline(timeout_s)
+        while not deadline.is_over:
             said = {s.message for s in list(self.diagnostics) if s.level != DiagnosticStatus.OK}
             if any(re.search(words, message) for message in said):
                 return ""
@@ -174,14 +175,14 @@ class Cell:
     def recover(self) -> None:
         """Until a projection becomes a stack again and all nodes are well; nothing is restarted."""
         nodes = [id(node) for node in self.nodes]
-        deadline_s = time.monotonic() + PATIENCE_S
+        deadline = Deadline(PATIENCE_S)
         while True:
             self.diagnostics.clear()
             wait(self.well, f"all to be well: {self.diagnostics}", PATIENCE_S)
             _, verdict = self.project()
             if verdict is not None and verdict.status == MatchedFrame.STACK_COMPLETE:
                 break
-            assert time.monotonic() < deadline_s, verdict
+            assert not deadline.is_over, verdict
         wait(lambda: self.stacks, "the stack")
         assert self.check_stacks() >= 1
         assert nodes == [id(node) for node in self.nodes]

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
+from support.patience import wait
 
-def wait_until_ended(pid: int, patience_s: float = 15.0) -> None:
+
+def wait_until_ended(pid: int) -> None:
     """Wait for a process that may be nobody's child: signals and init's reaping take a moment.
 
     One that has ended and waits to be reaped (state Z) has ended; in a container that may last.
     """
-    end_s = time.monotonic() + patience_s
-    while not _ended(pid):
-        assert time.monotonic() < end_s, f"process {pid} still runs"
-        time.sleep(0.01)
+    wait(lambda: _ended(pid), f"the end of process {pid}")
 
 
 def _ended(pid: int) -> bool:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,9 +16,7 @@ import pytest
 
 from sl_common.topics import NAMESPACE, Service, Topic
 from support.domains import ReservedDomain
-
-#: Discovery takes up to 2.2 s on a busy machine; whoever waits for it waits longer.
-PATIENCE_S = 15.0
+from support.patience import PATIENCE_S, patience, wait
 
 
 def require_ros() -> None:
@@ -31,16 +28,6 @@ def require_ros() -> None:
         pytest.importorskip("rclpy", reason="ROS (rclpy) is not installed")
         pytest.importorskip("rosidl_generator_py", reason="ROS is not complete")
     pytest.importorskip("sl_interfaces.msg", reason="sl_interfaces is not installed")
-
-
-def wait(predicate: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> Any:
-    """Wait until the predicate gives something true, and return it."""
-    deadline = time.monotonic() + timeout_s
-    while time.monotonic() < deadline:
-        if found := predicate():
-            return found
-        time.sleep(0.005)
-    pytest.fail(f"waited {timeout_s:g} s for {what}")
 
 
 class Graph:
@@ -109,14 +96,14 @@ class Graph:
     def call_async(self, service: Service, request: Any) -> Any:
         """Call a service."""
         client = self.tester.client(service)
-        assert client.wait_for_service(PATIENCE_S), f"nobody offers {service.name}"
+        assert client.wait_for_service(patience(PATIENCE_S)), f"nobody offers {service.name}"
         return client.call_async(request)
 
     def close(self) -> None:
         """End everything, in the order of a clean shutdown: no callback runs any more."""
         self._ended.set()
         self.executor.create_task(lambda: None)  # wakes it
-        self._thread.join(timeout=PATIENCE_S)
+        self._thread.join(timeout=patience(PATIENCE_S))
         self.executor.shutdown()
         for node in self._nodes:
             node.close()

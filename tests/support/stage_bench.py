@@ -14,6 +14,7 @@ from sl_camera.stage.manual_stage import ManualStage
 from sl_camera.stage.stage import Position, StageDriver
 from sl_camera.stage.zaber.zaber_stage import ZaberStage
 from sl_common.errors import DeviceError
+from support.patience import patience, wait
 
 FAST = 25.0
 
@@ -89,7 +90,7 @@ class Mover(threading.Thread):
         self._stage, self._target = stage, target
         self.error: DeviceError | None = None
         self.start()
-        until(lambda: stage.state().kind == "moving")
+        wait(lambda: stage.state().kind == "moving", "the motion")
 
     def run(self) -> None:
         try:
@@ -98,16 +99,9 @@ class Mover(threading.Thread):
             self.error = error
 
     def ended(self) -> DeviceError | None:
-        self.join(10.0)
+        self.join(patience(10.0))
         assert not self.is_alive()
         return self.error
-
-
-def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it never came true"
-        time.sleep(0.005)
 
 
 @contextmanager
