@@ -213,7 +213,7 @@ def test_a_controller_on_the_usb_that_is_of_another_kind_or_sick(on_usb: Rig) ->
     on_usb.configure("usb", dmd_model="DLP1")
     assert "there are DLP4500" in on_usb.find("projector").text
     on_usb.configure("usb")
-    on_usb.dmd._sequencer.aborted = True
+    on_usb.dmd.aborted = True
     finding = on_usb.find("projector")
     assert (finding.level, "sequencer aborted" in finding.text) == ("bad", True)
     on_usb.dmd.faults.taken = True

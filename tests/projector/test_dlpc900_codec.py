@@ -9,7 +9,8 @@ import struct
 import numpy as np
 import pytest
 
-from sl_bench.dlpc.dlpc900_images import ImageFault, decode_image
+from sl_bench.dlpc.dlpc900_images import decode_image
+from sl_bench.dlpc.dlpc_emulator import Refusal
 from sl_common.errors import SequenceError
 from sl_projector.dlpc import dlpc900_codec as codec
 from sl_projector.dlpc.dmd import dmd_model
@@ -207,19 +208,19 @@ def test_decoder_takes_optional_ends_of_line_and_both_headers():
     ],
 )
 def test_decoder_refuses_broken_enhanced_rle(data, words):
-    with pytest.raises(ImageFault, match=words):
+    with pytest.raises(Refusal, match=words):
         decode_image(enhanced(bytes.fromhex(data), 2, 2), 2, 2)
 
 
 def test_decoder_refuses_broken_headers():
     good = codec.encode_image(np.zeros((2, 2), np.uint32))
-    with pytest.raises(ImageFault, match="begins with"):
+    with pytest.raises(Refusal, match="begins with"):
         decode_image(b"Splc" + good[4:], 2, 2)
-    with pytest.raises(ImageFault, match="expected 4x2"):
+    with pytest.raises(Refusal, match="expected 4x2"):
         decode_image(good, 4, 2)
-    with pytest.raises(ImageFault, match="counts"):
+    with pytest.raises(Refusal, match="counts"):
         decode_image(good + b"\0", 2, 2)
-    with pytest.raises(ImageFault, match="compression 3") as fault:
+    with pytest.raises(Refusal, match="compression 3") as fault:
         decode_image(good[:25] + b"\x03" + good[26:], 2, 2)
     assert fault.value.code == 9
 

@@ -68,7 +68,7 @@ def test_second_process_is_told_that_the_device_is_taken(bench):
 def test_process_that_dies_gives_the_device_back(bench):
     first = driver(bench)
     first.open()
-    for connection in list(bench.server._connections):
+    for connection in list(bench.server.connections):
         connection.shutdown(socket.SHUT_RDWR)
     with pytest.raises(DeviceLost):
         first.status()

@@ -1,12 +1,15 @@
 """An emulated DLPC900 behind pyusb, with the real driver in front; for tests."""
 
+from __future__ import annotations
+
+import threading
+import time
 from dataclasses import dataclass, field
 
 import numpy as np
 import usb.core
 
 from sl_bench.dlpc.dlpc900_emulator import Dlpc900Emulator
-from sl_bench.dlpc.dlpc900_sequencer import VirtualClock
 from sl_bench.dlpc.usb_server import EmulatedUsb
 from sl_projector.dlpc.dlpc900_driver import Dlpc900, Dlpc900Settings
 from sl_projector.dlpc.dmd import Timing
@@ -15,6 +18,27 @@ from sl_projector.hid.usb_socket import LinkBackend
 REPLY_TIMEOUT_S = 0.3
 FAST = Timing(1e-3)
 START = 0x1A24
+
+
+class VirtualClock:
+    """A clock that does not sleep: waiting moves its time on at once."""
+
+    def __init__(self, start_ns: int = 1_700_000_000_000_000_000) -> None:
+        self._now_ns = start_ns
+        self._lock = threading.Lock()
+
+    def now_ns(self) -> int:
+        """Return the virtual time."""
+        return self._now_ns
+
+    def wait_until(self, deadline_ns: int, interrupt: threading.Event) -> bool:
+        """Move the time to ``deadline_ns``, unless ``interrupt`` is set."""
+        time.sleep(0)  # let other threads run: an endless sequence must not starve them
+        if interrupt.is_set():
+            return True
+        with self._lock:
+            self._now_ns = max(self._now_ns, deadline_ns)
+        return False
 
 
 @dataclass

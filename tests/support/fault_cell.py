@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 from sl_bench.camera.camera_emulator import CameraEmulator, Exposure
 from sl_bench.camera.camera_faults import CameraFaults
 from sl_bench.dlpc.dlpc900_emulator import Dlpc900Emulator
-from sl_bench.dlpc.dlpc900_faults import Dlpc900Faults
+from sl_bench.dlpc.dlpc_faults import DlpcFaults
 from sl_bench.dlpc.usb_server import EmulatedUsb
 from sl_bench.stage.grbl_emulator import GrblEmulator
 from sl_bench.stage.zaber_emulator import ZaberEmulator
@@ -190,7 +190,7 @@ class Cell:
     def heal(self) -> None:
         """Take all causes away."""
         self.camera.faults = CameraFaults()
-        for name, value in vars(Dlpc900Faults()).items():
+        for name, value in vars(DlpcFaults()).items():
             if not name.startswith("_"):
                 setattr(self.dmd.faults, name, value)
         self.usb.plug_in()

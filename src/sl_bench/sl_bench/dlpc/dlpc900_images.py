@@ -11,17 +11,10 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
+from sl_bench.dlpc.dlpc_emulator import BAD_COMPRESSION, INVALID_PARAMETER, Refusal
+
 HEADER_BYTES = 48
 SIGNATURE = b"Spld"
-
-
-class ImageFault(Exception):
-    """An image that the controller would not show, with its error code (0x0100)."""
-
-    def __init__(self, code: int, reason: str) -> None:
-        super().__init__(reason)
-        self.code = code
-        self.reason = reason
 
 
 class _Stream:
@@ -34,7 +27,9 @@ class _Stream:
     def byte(self) -> int:
         """Take one byte."""
         if self.at >= len(self._data):
-            raise ImageFault(6, f"image data ends after {self.at} bytes without an end mark")
+            raise Refusal(
+                INVALID_PARAMETER, f"image data ends after {self.at} bytes without an end mark"
+            )
         self.at += 1
         return self._data[self.at - 1]
 
@@ -42,7 +37,9 @@ class _Stream:
         """Take ``count`` bytes."""
         part = self._data[self.at : self.at + count]
         if len(part) < count:
-            raise ImageFault(6, f"image data ends within {count} pixel bytes at {self.at}")
+            raise Refusal(
+                INVALID_PARAMETER, f"image data ends within {count} pixel bytes at {self.at}"
+            )
         self.at += count
         return part
 
@@ -62,7 +59,9 @@ class _Canvas:
 
     def _room(self, count: int) -> slice:
         if self.at + count > len(self.pixels) or self.at % self.width + count > self.width:
-            raise ImageFault(6, f"{count} pixels at pixel {self.at} leave the line or the image")
+            raise Refusal(
+                INVALID_PARAMETER, f"{count} pixels at pixel {self.at} leave the line or the image"
+            )
         self.at += count
         return slice(self.at - count, self.at)
 
@@ -78,7 +77,7 @@ class _Canvas:
     def copy_above(self, count: int) -> None:
         """Put ``count`` pixels of the line above."""
         if self.at < self.width:
-            raise ImageFault(6, "copy from the line above on the first line")
+            raise Refusal(INVALID_PARAMETER, "copy from the line above on the first line")
         room = self._room(count)
         above = slice(room.start - self.width, room.stop - self.width)
         self.pixels[room] = self.pixels[above]
@@ -128,7 +127,7 @@ def _uncompressed(data: bytes, width: int, height: int) -> NDArray[np.uint8]:
         if len(data) == stride * height:
             rows = np.frombuffer(data, np.uint8).reshape(height, stride)
             return rows[:, :line].reshape(-1, 3)
-    raise ImageFault(6, f"{len(data)} bytes of pixels; expected {padded * height}")
+    raise Refusal(INVALID_PARAMETER, f"{len(data)} bytes of pixels; expected {padded * height}")
 
 
 def decode_image(
@@ -139,9 +138,8 @@ def decode_image(
     Parameters
     ----------
     stream : bytes
-        The 48-byte header and the encoded pixels. Both ways of counting the bytes in the header
-        (with and without the header itself) are found in the field and accepted, as are both
-        values of bytes 24 and 29.
+        The 48-byte header and the encoded pixels. The header may count its own bytes or not, and
+        bytes 24 and 29 may have either value: hosts do both.
     width, height : int
         What the controller drives; another size is a fault.
     strict : bool
@@ -155,17 +153,19 @@ def decode_image(
 
     Raises
     ------
-    ImageFault
+    Refusal
         When the controller would refuse or garble it.
     """
     if len(stream) < HEADER_BYTES or stream[:4] != SIGNATURE:
-        raise ImageFault(6, f"image begins with {stream[:4]!r}; expected {SIGNATURE!r}")
+        raise Refusal(
+            INVALID_PARAMETER, f"image begins with {stream[:4]!r}; expected {SIGNATURE!r}"
+        )
     columns, rows, counted = struct.unpack_from("<HHI", stream, 4)
     if (columns, rows) != (width, height):
-        raise ImageFault(6, f"image of {columns}x{rows}; expected {width}x{height}")
+        raise Refusal(INVALID_PARAMETER, f"image of {columns}x{rows}; expected {width}x{height}")
     data = stream[HEADER_BYTES:]
     if (strict or stream[25] == 0) and counted not in (len(data), len(stream)):
-        raise ImageFault(6, f"header counts {counted} bytes; got {len(data)}")
+        raise Refusal(INVALID_PARAMETER, f"header counts {counted} bytes; got {len(data)}")
     pixels = _pixels(stream[25], data, width, height)
     # On the wire planes 16-23 come first.
     return np.ascontiguousarray(pixels[:, ::-1].T).reshape(3, height, width)
@@ -180,8 +180,10 @@ def _pixels(compression: int, data: bytes, width: int, height: int) -> NDArray[n
     elif compression == 2:
         _enhanced_run_length(stream, canvas)
     else:
-        raise ImageFault(9, f"compression {compression}; expected 0, 1 or 2")
+        raise Refusal(BAD_COMPRESSION, f"compression {compression}; expected 0, 1 or 2")
     canvas.end_line()
     if canvas.at != len(canvas.pixels):
-        raise ImageFault(6, f"image ends after {canvas.at} of {len(canvas.pixels)} pixels")
+        raise Refusal(
+            INVALID_PARAMETER, f"image ends after {canvas.at} of {len(canvas.pixels)} pixels"
+        )
     return canvas.pixels

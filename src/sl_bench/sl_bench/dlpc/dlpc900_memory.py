@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_bench.dlpc.dlpc900_images import ImageFault, decode_image
-from sl_bench.dlpc.dlpc900_refusal import INVALID_PARAMETER, NOT_PRESENT, Refusal
+from sl_bench.dlpc.dlpc900_images import decode_image
+from sl_bench.dlpc.dlpc_emulator import INVALID_PARAMETER, NOT_PRESENT, Refusal
 from sl_projector.dlpc.dmd import DmdModel
 
 MAX_FLY_IMAGES = 18
@@ -59,13 +59,29 @@ class ImageMemory:
         return all(image in controller.images for controller in self._controllers)
 
     def plane(self, image: int, plane: int) -> NDArray[np.bool_]:
-        """Return a bit plane, shape (rows, columns), True where the mirror is on."""
+        """Return a bit plane, (rows, columns), True where the mirror is on.
+
+        Parameters
+        ----------
+        image : int
+            A complete image; see `holds`.
+        plane : int
+            0 to 23.
+        """
         parts = [c.images[image][plane // 8] for c in self._controllers]
         mirrors: NDArray[np.bool_] = (np.hstack(parts) & np.uint8(1 << plane % 8)) != 0
         return mirrors
 
     def begin(self, controller: int, data: bytes) -> None:
-        """Begin to load an image (0x1A2A, 0x1A2C)."""
+        """Begin to load an image (0x1A2A, 0x1A2C).
+
+        Parameters
+        ----------
+        controller : {0, 1}
+            Primary, secondary.
+        data : bytes
+            Image (u16), its size in bytes (u32).
+        """
         target = self._controller(controller)
         image, total = struct.unpack_from("<HI", data)
         if image & 0x1F >= MAX_FLY_IMAGES:
@@ -74,11 +90,19 @@ class ImageMemory:
         target.upload = _Upload(image & 0x1F, total)
 
     def take(self, controller: int, data: bytes) -> None:
-        """Take the next part of the image (0x1A2B, 0x1A2D); the last one decodes it."""
+        """Take the next part of the image (0x1A2B, 0x1A2D); the last one decodes it.
+
+        Parameters
+        ----------
+        controller : {0, 1}
+            Primary, secondary.
+        data : bytes
+            Number of bytes (u16), the bytes.
+        """
         target = self._controller(controller)
         upload = target.upload
         count = struct.unpack_from("<H", data)[0] & 0x3FF
-        if not count:  # Pycrafter6500 and its kin end so where the parts fill the image
+        if not count:  # some hosts (Pycrafter6500) end with an empty part
             return
         if upload is None:
             raise Refusal(NOT_PRESENT, "image data without its start")
@@ -99,7 +123,4 @@ class ImageMemory:
             raise Refusal(
                 INVALID_PARAMETER, f"{len(upload.data)} bytes of image; announced {upload.total}"
             )
-        try:
-            return decode_image(bytes(upload.data), self._width, self._height, strict=self._strict)
-        except ImageFault as fault:
-            raise Refusal(fault.code, fault.reason) from fault
+        return decode_image(bytes(upload.data), self._width, self._height, strict=self._strict)

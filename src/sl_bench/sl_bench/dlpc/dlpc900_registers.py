@@ -8,19 +8,23 @@ from __future__ import annotations
 
 import struct
 
+FLIP_COLUMNS, FLIP_ROWS = 0x1008, 0x1009
 INVERT_DATA = 0x1A30
+#: Registers of the trigger outputs 1 and 2.
+TRIGGER_OUT = {1: 0x1A1D, 2: 0x1A1E}
+TRIGGER_IN_DELAY = 0x1A35
 ACTIVE_BLOCKS = 0x1A40
 
 STORED = {
     0x1000: bytes(16),
-    0x1008: b"\x00",
-    0x1009: b"\x00",
+    FLIP_COLUMNS: b"\x00",
+    FLIP_ROWS: b"\x00",
     0x1100: bytes(6),
     0x1A00: b"\x00",
     0x1A07: b"\x08",
-    0x1A1D: bytes(5),
-    0x1A1E: bytes(5),
-    0x1A35: struct.pack("<HB", 105, 0),
+    TRIGGER_OUT[1]: bytes(5),
+    TRIGGER_OUT[2]: bytes(5),
+    TRIGGER_IN_DELAY: struct.pack("<HB", 105, 0),
     0x1A36: b"\x00",
     ACTIVE_BLOCKS: b"\x00\x10",
     0x0202: b"\x00",  # controller that is asked

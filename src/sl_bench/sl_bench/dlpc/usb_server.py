@@ -1,5 +1,7 @@
-"""USB's side of an emulated HID device: reports queued for the host, faults of the bus, and a
-server that lends the device to another process over a Unix socket (`sl_projector.hid.usb_socket`).
+"""USB's side of an emulated HID device.
+
+Reports queued for the host, faults of the bus, and a server that lends the device to another
+process over a Unix socket (`sl_projector.hid.usb_socket`).
 """
 
 from __future__ import annotations
@@ -8,26 +10,29 @@ import contextlib
 import errno
 import os
 import socket
+import socketserver
 import struct
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn, Protocol
 
-from sl_bench.dlpc.dlpc900_faults import Dlpc900Faults
+from sl_bench.dlpc.dlpc_faults import DlpcFaults
 from sl_projector.hid import usb_socket as wire
 from sl_projector.hid.usb_socket import UsbIdentity, UsbLink
 
 MAX_QUEUED_REPORTS = 64  # as many as Linux keeps for a hidraw reader
 SHORT_REPORT_BYTES = 3
+_POLL_S = 0.1
 DLPC900_IDENTITY = UsbIdentity(0x0451, 0xC900, "EMU0001")
 
 
 class HidDevice(Protocol):
     """A device behind the bus: takes reports, returns reports."""
 
-    faults: Dlpc900Faults
+    faults: DlpcFaults
 
     def receive(self, report: bytes) -> list[bytes]:
         """Take a report, return what is answered."""
@@ -55,13 +60,20 @@ class EmulatedUsb:
         What receives the reports, e.g. a `Dlpc900Emulator`.
     identity : UsbIdentity
         Vendor, product and serial number.
+
+    Attributes
+    ----------
+    present : bool
+        Whether the device is on the bus.
+    unplugged : int
+        How often it was taken out.
     """
 
     def __init__(self, device: HidDevice, identity: UsbIdentity = DLPC900_IDENTITY) -> None:
         self.device = device
         self.identity = identity
         self.present = True
-        self._plugged = 0
+        self.unplugged = 0
         self._owner: EmulatedLink | None = None
         self._replies: deque[tuple[float, bytes]] = deque(maxlen=MAX_QUEUED_REPORTS)
         self._ready = threading.Condition()
@@ -79,7 +91,7 @@ class EmulatedUsb:
         """Take the device from the bus; it keeps its power and its state."""
         with self._ready:
             self.present = False
-            self._plugged += 1
+            self.unplugged += 1
             self._owner = None
             self._ready.notify_all()
 
@@ -96,15 +108,10 @@ class EmulatedUsb:
         self.device.power_cycle()
         self.plug_in()
 
-    def check_present(self, plugged: int) -> None:
-        """Raise ENODEV when the device is not, or not any more, the one that was opened."""
-        if not self.present or plugged != self._plugged:
+    def check_present(self, link: EmulatedLink) -> None:
+        """Raise ENODEV when the device is gone, or is not the one any more that was opened."""
+        if not self.present or link.unplugged != self.unplugged:
             _fail(errno.ENODEV)
-
-    @property
-    def plugged(self) -> int:
-        """Number of times that it was taken out."""
-        return self._plugged
 
     def claim(self, link: EmulatedLink) -> None:
         """Give the interface to a host; EBUSY when another has it."""
@@ -124,23 +131,27 @@ class EmulatedUsb:
                 self._owner = None
 
     def transfer_out(self, link: EmulatedLink, report: bytes) -> None:
-        """Carry a report to the device and queue what it answers."""
+        """Carry a report to the device and queue what it answers.
+
+        Parameters
+        ----------
+        link : EmulatedLink
+            The host, which must have claimed the interface.
+        report : bytes
+            See `HidDevice.receive`.
+        """
         self._check_transfer(link)
         replies = self.device.receive(report)
-        if replies:
-            self._overwrite()
+        if replies:  # the controller has one buffer for answers: what was not read is gone
+            now_s = time.monotonic()
+            with self._ready:
+                late = [entry for entry in self._replies if entry[0] > now_s]
+                self._replies = deque(late, maxlen=MAX_QUEUED_REPORTS)
         for reply in replies:
             self._queue(reply)
 
-    def _overwrite(self) -> None:
-        """Drop what the host did not read: the controller has one buffer for answers."""
-        now_s = time.monotonic()
-        with self._ready:
-            late = [entry for entry in self._replies if entry[0] > now_s]
-            self._replies.clear()
-            self._replies.extend(late)
-
     def _check_transfer(self, link: EmulatedLink) -> None:
+        self.check_present(link)
         if self._owner is not link:
             _fail(errno.ENODEV)
         if self.device.faults.take("stalls"):
@@ -165,7 +176,17 @@ class EmulatedUsb:
             self._ready.notify_all()
 
     def transfer_in(self, link: EmulatedLink, size: int, timeout_ms: int) -> bytes:
-        """Wait for a report from the device."""
+        """Wait for a report from the device.
+
+        Parameters
+        ----------
+        link : EmulatedLink
+            The host, which must have claimed the interface.
+        size : int
+            Most bytes to return.
+        timeout_ms : int
+            Longest wait, milliseconds.
+        """
         self._check_transfer(link)
         deadline_s = time.monotonic() + timeout_ms / 1000
         with self._ready:
@@ -184,11 +205,17 @@ class EmulatedUsb:
 
 
 class EmulatedLink:
-    """One host's view of the emulated bus; a `UsbLink`."""
+    """One host's view of the emulated bus; a `UsbLink`.
+
+    Parameters
+    ----------
+    bus : EmulatedUsb
+        The bus.
+    """
 
     def __init__(self, bus: EmulatedUsb) -> None:
         self._bus = bus
-        self._plugged = bus.plugged
+        self.unplugged = bus.unplugged
 
     def describe(self) -> UsbIdentity:
         """See `UsbLink`."""
@@ -198,7 +225,7 @@ class EmulatedLink:
 
     def claim(self) -> None:
         """See `UsbLink`."""
-        self._plugged = self._bus.plugged
+        self.unplugged = self._bus.unplugged
         self._bus.claim(self)
 
     def release(self) -> None:
@@ -207,18 +234,16 @@ class EmulatedLink:
 
     def write(self, endpoint: int, report: bytes, timeout_ms: int) -> int:
         """See `UsbLink`."""
-        self._bus.check_present(self._plugged)
         self._bus.transfer_out(self, report)
         return len(report)
 
     def read(self, endpoint: int, size: int, timeout_ms: int) -> bytes:
         """See `UsbLink`."""
-        self._bus.check_present(self._plugged)
         return self._bus.transfer_in(self, size, timeout_ms)
 
     def clear_halt(self, endpoint: int) -> None:
         """See `UsbLink`."""
-        self._bus.check_present(self._plugged)
+        self._bus.check_present(self)
 
     def kernel_driver_active(self) -> bool:
         """See `UsbLink`."""
@@ -233,32 +258,57 @@ class EmulatedLink:
 
 
 def _perform(link: UsbLink, request: bytes) -> bytes:
+    """Do what a request asks, return the answer's payload."""
     operation, endpoint, timeout_ms = wire.REQUEST.unpack_from(request)
     payload = request[wire.REQUEST.size :]
     if operation == wire.DESCRIBE:
         identity = link.describe()
         return wire.IDENTITY.pack(identity.vendor, identity.product) + identity.serial.encode()
-    if operation == wire.WRITE:
-        link.write(endpoint, payload, timeout_ms)
-        return b""
     if operation == wire.READ:
         return link.read(endpoint, wire.SIZE.unpack(payload)[0], timeout_ms)
     if operation == wire.KERNEL_DRIVER:
         return bytes([link.kernel_driver_active()])
-    simple = {
+    silent: dict[int, Callable[[], object]] = {
+        wire.WRITE: lambda: link.write(endpoint, payload, timeout_ms),
         wire.CLAIM: link.claim,
         wire.RELEASE: link.release,
         wire.CLEAR_HALT: lambda: link.clear_halt(endpoint),
         wire.DETACH: link.detach_kernel_driver,
         wire.ATTACH: link.attach_kernel_driver,
     }
-    if operation not in simple:
+    if operation not in silent:
         _fail(errno.ENOSYS)
-    simple[operation]()
+    silent[operation]()
     return b""
 
 
-class UsbSocketServer:
+class _Connection(socketserver.BaseRequestHandler):
+    """One connection: one opened device."""
+
+    server: UsbSocketServer
+
+    def handle(self) -> None:
+        link = self.server.bus.connect()
+        self.server.connections.add(self.request)
+        try:
+            with contextlib.suppress(OSError):
+                while True:
+                    wire.send_frame(self.request, self._respond(link))
+        finally:
+            link.release()
+            self.server.connections.discard(self.request)
+
+    def _respond(self, link: UsbLink) -> bytes:
+        request = wire.receive_frame(self.request)
+        try:
+            return wire.ANSWER.pack(0) + _perform(link, request)
+        except OSError as error:
+            return wire.ANSWER.pack(error.errno or errno.EIO)
+        except struct.error:
+            return wire.ANSWER.pack(errno.EINVAL)
+
+
+class UsbSocketServer(socketserver.ThreadingUnixStreamServer):
     """Lends an emulated device to other processes, one connection an opened device.
 
     Parameters
@@ -269,61 +319,24 @@ class UsbSocketServer:
         The device.
     """
 
+    daemon_threads = True
+
     def __init__(self, path: str, bus: EmulatedUsb) -> None:
+        self.bus = bus
+        self.connections: set[socket.socket] = set()
         self._path = Path(path)
-        self._bus = bus
-        self._closed = threading.Event()
-        self._threads: list[threading.Thread] = []
-        self._connections: set[socket.socket] = set()
         self._path.unlink(missing_ok=True)
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._listener.bind(path)
+        super().__init__(path, _Connection)
         self._path.chmod(0o600)
-        self._listener.listen()
-        self._start(self._accept, "usb-accept")
-
-    def _start(self, target: object, name: str, *args: object) -> None:
-        thread = threading.Thread(target=target, args=args, name=name, daemon=True)  # type: ignore[arg-type]
-        self._threads = [t for t in self._threads if t.is_alive()] + [thread]
-        thread.start()
-
-    def _accept(self) -> None:
-        while not self._closed.is_set():
-            try:
-                connection, _ = self._listener.accept()
-            except OSError:
-                return
-            self._connections.add(connection)
-            self._start(self._serve, "usb-serve", connection)
-
-    def _serve(self, connection: socket.socket) -> None:
-        link = self._bus.connect()
-        try:
-            with connection, contextlib.suppress(OSError):
-                while True:
-                    wire.send_frame(connection, self._respond(link, connection))
-        finally:
-            link.release()
-            self._connections.discard(connection)
-
-    def _respond(self, link: UsbLink, connection: socket.socket) -> bytes:
-        request = wire.receive_frame(connection)
-        try:
-            return wire.ANSWER.pack(0) + _perform(link, request)
-        except OSError as error:
-            return wire.ANSWER.pack(error.errno or errno.EIO)
-        except struct.error:
-            return wire.ANSWER.pack(errno.EINVAL)
+        threading.Thread(
+            target=self.serve_forever, args=(_POLL_S,), name="usb server", daemon=True
+        ).start()
 
     def close(self) -> None:
         """Drop all connections and remove the socket."""
-        self._closed.set()
-        with contextlib.suppress(OSError):
-            self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
-        for connection in list(self._connections):
+        self.shutdown()
+        self.server_close()
+        for connection in list(self.connections):
             with contextlib.suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
-        for thread in self._threads:
-            thread.join(5.0)
         self._path.unlink(missing_ok=True)

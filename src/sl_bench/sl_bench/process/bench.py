@@ -27,7 +27,7 @@ from sl_bench.camera.camera_emulator import CameraEmulator, Endpoint, Execute, E
 from sl_bench.camera.camera_faults import CameraFaults
 from sl_bench.camera.gige_camera import GigeCamera
 from sl_bench.dlpc.dlpc900_emulator import Dlpc900Emulator
-from sl_bench.dlpc.dlpc900_faults import Dlpc900Faults
+from sl_bench.dlpc.dlpc_faults import DlpcFaults
 from sl_bench.dlpc.usb_server import EmulatedUsb, UsbSocketServer
 from sl_bench.process.bench_control import ControlServer
 from sl_bench.process.bench_settings import BenchSettings, read_settings
@@ -237,7 +237,7 @@ class Bench:
     def _clear_faults(self) -> None:
         self.camera.faults = CameraFaults()
         self._fault_packets(0.0, True)
-        self._fault_dmd({f.name: getattr(Dlpc900Faults(), f.name) for f in _dmd_faults()})
+        self._fault_dmd({f.name: getattr(DlpcFaults(), f.name) for f in _dmd_faults()})
         self.stage.open_switches()
         self.stage.jam(False)
         self.stage.fall_silent(False)
@@ -293,7 +293,7 @@ class Bench:
 
 
 def _dmd_faults() -> list[Any]:
-    return [f for f in fields(Dlpc900Faults) if not f.name.startswith("_")]
+    return [f for f in fields(DlpcFaults) if not f.name.startswith("_")]
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:

@@ -8,7 +8,7 @@ request                                               effect
 ``{"lamp": 0.5}``                                     projector light, 1 is normal, 0 is off
 ``{"fault": {"camera": {"drop": 0.01, "seed": 1}}}``  faults of the camera from here on
                                                       (`CameraFaults`), or ``{"disconnect_s": 1}``
-``{"fault": {"projector": {"refuse": 1}}}``           fields of `Dlpc900Faults`, or ``{"unplug_s":
+``{"fault": {"projector": {"refuse": 1}}}``           fields of `DlpcFaults`, or ``{"unplug_s":
                                                       1}``, ``{"power_cycle": true}``
 ``{"fault": {"stage": {"alarm": 1}}}``                a fault method of `GrblEmulator`, its argument
                                                       (a list where there are several), or

@@ -1,4 +1,4 @@
-"""What the emulated DLPC900 does wrong on request."""
+"""What an emulated DLPC does wrong on request."""
 
 from __future__ import annotations
 
@@ -7,41 +7,31 @@ from dataclasses import dataclass, field
 
 
 @dataclass
-class Dlpc900Faults:
+class DlpcFaults:
     """Set a field to make it happen; counts run down to nothing as they happen.
 
-    Unplugging, plugging in and power cycles are methods of `Dlpc900Usb`.
+    Unplugging, plugging in and power cycles are methods of `EmulatedUsb`.
 
     Parameters
     ----------
-    refuse : int
-        So many next commands (other than reading the error) are refused.
-    refuse_code : int
-        The error code that these give.
-    lose_replies : int
-        So many next replies are never sent.
-    late_replies : int
-        So many next replies come ``late_s`` late.
+    refuse, refuse_code : int
+        Number of next commands (other than reading the error) that are refused, and the error
+        code that they give.
+    lose_replies, late_replies, stale_replies, short_replies, empty_replies : int
+        Number of next replies that are never sent, come ``late_s`` late, are preceded by one with
+        an old sequence byte, are cut to 3 bytes, come without their data.
     late_s : float
         How late, seconds.
-    stale_replies : int
-        So many next replies are preceded by one with an old sequence byte.
-    short_replies : int
-        So many next replies are cut to 3 bytes.
-    empty_replies : int
-        So many next replies come without their data.
     stalls : int
-        So many next transfers stall (EPIPE).
+        Number of next transfers that stall (EPIPE).
     kernel_driver : bool
         The kernel's driver holds the interface (claiming gives EBUSY until it is detached).
     taken : bool
         Another program holds the interface (claiming gives EBUSY).
     abort_at : int or None
         The sequencer aborts in place of this exposure.
-    lost_edges : set of int
-        Exposures of the next run whose trigger edge is missing.
-    doubled_edges : set of int
-        Exposures of the next run with two trigger edges.
+    lost_edges, doubled_edges : set of int
+        Exposures of the next run whose trigger edge is missing, or comes twice.
     """
 
     refuse: int = 0
@@ -70,10 +60,8 @@ class Dlpc900Faults:
 
     def edges(self, exposure: int) -> int:
         """Return how many trigger edges an exposure gives: 1 when all is well."""
-        if exposure in self.lost_edges:
-            self.lost_edges.discard(exposure)
-            return 0
-        if exposure in self.doubled_edges:
-            self.doubled_edges.discard(exposure)
-            return 2
+        for exposures, count in ((self.lost_edges, 0), (self.doubled_edges, 2)):
+            if exposure in exposures:
+                exposures.discard(exposure)
+                return count
         return 1

@@ -1,47 +1,37 @@
-"""The emulated DLPC900's sequencer: shows patterns by the clock and raises trigger edges."""
+"""An emulated DLPC's sequencer: shows patterns by the clock and raises trigger edges."""
 
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_bench.dlpc.dlpc900_faults import Dlpc900Faults
+from sl_bench.dlpc.dlpc_faults import DlpcFaults
 from sl_common.clock import Clock
 
 Mirrors = NDArray[np.bool_]
 OnExposure = Callable[[Mirrors, int, int, float], None]
 
 
-class VirtualClock:
-    """A clock that does not sleep: waiting moves its time on at once."""
-
-    def __init__(self, start_ns: int = 1_700_000_000_000_000_000) -> None:
-        self._now_ns = start_ns
-        self._lock = threading.Lock()
-
-    def now_ns(self) -> int:
-        """Return the virtual time."""
-        return self._now_ns
-
-    def wait_until(self, deadline_ns: int, interrupt: threading.Event) -> bool:
-        """Move the time to ``deadline_ns``, unless ``interrupt`` is set."""
-        time.sleep(0)  # let other threads run: an endless sequence must not starve them
-        if interrupt.is_set():
-            return True
-        with self._lock:
-            self._now_ns = max(self._now_ns, deadline_ns)
-        return False
-
-
 @dataclass(frozen=True)
 class Slot:
-    """One pattern of the sequence as the pattern table defines it."""
+    """One pattern of the sequence as the pattern table defines it.
+
+    Parameters
+    ----------
+    image, bit, depth : int
+        The image, its first bit plane that is shown, and how many.
+    exposure_us, dark_us : int
+        Lit, then dark, microseconds.
+    wait_trigger : bool
+        Whether it begins at an edge of TRIG_IN_1.
+    trigger_out_2 : bool
+        Whether it raises an edge of the second trigger output.
+    """
 
     image: int
     bit: int
@@ -49,7 +39,7 @@ class Slot:
     exposure_us: int
     dark_us: int
     wait_trigger: bool
-    trigger_out_2: bool
+    trigger_out_2: bool = True
 
 
 @dataclass(frozen=True)
@@ -73,6 +63,8 @@ class Program:
         Delay of that output's rising edge.
     trigger_in_delay_us : int
         From the edge on TRIG_IN_1 to the exposure.
+    halt : Event
+        Ends the program when it is set.
     """
 
     slots: tuple[Slot, ...]
@@ -82,6 +74,7 @@ class Program:
     camera_output: int
     edge_delay_us: int
     trigger_in_delay_us: int
+    halt: threading.Event = field(default_factory=threading.Event)
 
 
 class Sequencer:
@@ -91,14 +84,30 @@ class Sequencer:
     ----------
     clock : Clock
         What exposures are scheduled by, from absolute deadlines.
-    faults : Dlpc900Faults
+    faults : DlpcFaults
         What goes wrong on request.
-    dark : ndarray of bool, shape (rows, columns)
+    dark : ndarray of bool, (rows, columns)
         The mirrors when nothing is shown.
+    on_exposure : callable, optional
+        Called on the sequencer's thread at each trigger edge: mirrors (bool, (rows, columns),
+        read-only), number of the exposure in the run, time of the edge (host clock, ns), exposure
+        in seconds.
+
+    Attributes
+    ----------
+    start_ns : list of int
+        Start of each exposure of the last run, host clock, ns.
+    exposure : int
+        Number of the exposure shown now or last.
+    aborted : bool
+        Whether the last run was aborted.
     """
 
-    def __init__(self, clock: Clock, faults: Dlpc900Faults, dark: Mirrors) -> None:
-        self.on_exposure: OnExposure | None = None
+    def __init__(
+        self, clock: Clock, faults: DlpcFaults, dark: Mirrors, on_exposure: OnExposure | None = None
+    ) -> None:
+        self.on_exposure = on_exposure
+        self.exposure = 0
         self.start_ns: list[int] = []
         self.aborted = False
         self._clock = clock
@@ -110,17 +119,11 @@ class Sequencer:
         self._edges_ns: deque[int] = deque(maxlen=1)
         self._waiting = False
         self._thread: threading.Thread | None = None
-        self._exposure = 0
 
     @property
     def running(self) -> bool:
         """True from start until the last dark time is over."""
         return self._thread is not None and self._thread.is_alive()
-
-    @property
-    def exposure(self) -> int:
-        """Number of the exposure shown now or last."""
-        return self._exposure
 
     def mirrors_now(self) -> Mirrors:
         """Return the mirrors as they stand, shape (rows, columns), True is bright."""
@@ -129,12 +132,12 @@ class Sequencer:
     def start(self, program: Program) -> None:
         """Begin to show a program; returns when it is running."""
         self.halt()
-        self._halt, self.aborted = threading.Event(), False
+        self._halt, self.aborted = program.halt, False
         self._edge.clear()
         self.start_ns = []
         began_ns = self._clock.now_ns()
         self._thread = threading.Thread(
-            target=self._show, args=(program, began_ns, self._halt), name="dlpc900", daemon=True
+            target=self._show, args=(program, began_ns), name="sequencer", daemon=True
         )
         self._thread.start()
 
@@ -155,8 +158,8 @@ class Sequencer:
         self._edge.set()
         return True
 
-    def _show(self, program: Program, begin_ns: int, halt: threading.Event) -> None:
-        exposure = program.first
+    def _show(self, program: Program, begin_ns: int) -> None:
+        exposure, halt = program.first, program.halt
         while not halt.is_set() and (not program.exposures or exposure < program.exposures):
             slot = program.slots[exposure % len(program.slots)]
             mirrors = program.mirrors_of(slot)
@@ -167,7 +170,8 @@ class Sequencer:
             if self._faults.abort_at == exposure:
                 self._faults.abort_at, self.aborted = None, True
                 break
-            self._expose(program, slot, mirrors, exposure, begin_ns, halt)
+            self.exposure, self._shown = exposure, mirrors
+            self._expose(program, slot, begin_ns)
             begin_ns += (slot.exposure_us + slot.dark_us) * 1000
             exposure += 1
         self._clock.wait_until(begin_ns, halt)
@@ -182,23 +186,18 @@ class Sequencer:
         self._waiting = False
         return self._edges_ns.pop() if self._edges_ns else self._clock.now_ns()
 
-    def _expose(
-        self, program: Program, slot: Slot, mirrors: Mirrors, exposure: int, begin_ns: int,
-        halt: threading.Event,
-    ) -> None:  # fmt: skip
-        self._exposure = exposure
-        self._shown = mirrors
+    def _expose(self, program: Program, slot: Slot, begin_ns: int) -> None:
         self.start_ns.append(begin_ns)
-        if self.on_exposure is not None and self._raises_edge(program, slot, exposure):
+        if self.on_exposure is not None and self._raises_edge(program, slot):
             edge_ns = begin_ns + program.edge_delay_us * 1000
-            for _ in range(self._faults.edges(exposure)):
-                self.on_exposure(mirrors, exposure, edge_ns, slot.exposure_us * 1e-6)
-        if slot.dark_us and not self._clock.wait_until(begin_ns + slot.exposure_us * 1000, halt):
+            for _ in range(self._faults.edges(self.exposure)):
+                self.on_exposure(self._shown, self.exposure, edge_ns, slot.exposure_us * 1e-6)
+        exposed_ns = begin_ns + slot.exposure_us * 1000
+        if slot.dark_us and not self._clock.wait_until(exposed_ns, program.halt):
             self._shown = self._dark
 
-    @staticmethod
-    def _raises_edge(program: Program, slot: Slot, exposure: int) -> bool:
+    def _raises_edge(self, program: Program, slot: Slot) -> bool:
         if program.camera_output == 2:
             return slot.trigger_out_2
-        before = program.slots[(exposure - 1) % len(program.slots)]
-        return exposure == program.first or before.dark_us > 0 or slot.wait_trigger
+        before = program.slots[(self.exposure - 1) % len(program.slots)]
+        return self.exposure == program.first or before.dark_us > 0 or slot.wait_trigger
