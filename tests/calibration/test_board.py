@@ -10,8 +10,8 @@ import pytest
 
 from sl_bringup.cli.main import main
 from sl_calibration.board.chessboard import Board, BoardView, board_view, solve_board
-from sl_calibration.solve.linear import Sensor
-from sl_calibration.verify.verification import triangulate
+from sl_calibration.solve.linear_step import Sensor
+from sl_calibration.solve.ray_midpoints import triangulate
 from sl_common.errors import CalibrationError
 from sl_projector.sequence.pattern_sequence import AXES, Pattern, PatternSequence, named
 from sl_projector.sequence.sequence_file import load_sequence

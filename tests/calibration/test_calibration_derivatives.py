@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from sl_bench.world.mounting import Mounting
-from sl_calibration.data.observations import Holes, Targets
-from sl_calibration.solve.bundle_adjustment import FlatPrior, Freedom, RigProblem
-from sl_calibration.solve.derivatives import intersect, meet, moved, project
-from sl_calibration.solve.robust_lm import triangle
-from sl_calibration.solve.stage_model import StagePrior, stage_report
+from sl_calibration.bundle.bundle_adjustment import RigProblem
+from sl_calibration.bundle.covariance import triangle
+from sl_calibration.bundle.derivatives import intersect, meet, moved, project
+from sl_calibration.bundle.parameters import FlatPrior, Freedom
+from sl_calibration.bundle.stage_model import StagePrior, stage_report
+from sl_calibration.data.solver_input import Holes, Targets
 from sl_common.errors import CalibrationError
 from sl_reconstruct.model.rig import BrownConrady, Device
 from support.calibration_scenes import RIG, Scene

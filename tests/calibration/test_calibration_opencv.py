@@ -10,7 +10,7 @@ import pytest
 
 from sl_calibration.board.planar_target import solve_free, solve_free_pair
 from sl_calibration.report.opencv_export import opencv_values, save_opencv
-from sl_calibration.solve.linear import Sensor
+from sl_calibration.solve.linear_step import Sensor
 from sl_common.errors import CalibrationError
 from sl_reconstruct.model.calibration_file import load_rig
 from sl_reconstruct.model.rig import BrownConrady, Device

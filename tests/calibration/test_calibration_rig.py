@@ -8,30 +8,20 @@ import numpy as np
 import pytest
 
 from sl_bench.world.mounting import Mounting
-from sl_calibration.data.observations import Holes, Targets
-from sl_calibration.solve.bundle_adjustment import (
-    Bundle,
-    FlatPrior,
-    Freedom,
-    RigProblem,
-    solve_bundle,
-)
+from sl_calibration.bundle.bundle_adjustment import Bundle, RigProblem, solve_bundle
+from sl_calibration.bundle.parameters import FlatPrior, Freedom
+from sl_calibration.bundle.stage_model import FAULTLESS, StagePrior
+from sl_calibration.data.solver_input import Holes, Targets
+from sl_calibration.solve.acceptance import Limits, judge
 from sl_calibration.solve.cross_validation import leave_heights_out
-from sl_calibration.solve.rig_solution import RigSolution, metres_per_pixel, solve_rig, thinned
-from sl_calibration.solve.stage_model import FAULTLESS, StagePrior
-from sl_calibration.solve.stages import rig_of, solve_camera
-from sl_calibration.solve.uncertainty import (
-    EdgeNoise,
-    Limits,
-    Volume,
-    judge,
-    point_covariance,
-    sigma_map,
-    uncovered_part,
-)  # fmt: skip
+from sl_calibration.solve.observability import uncovered_part
+from sl_calibration.solve.point_uncertainty import EdgeNoise, Volume, point_covariance, sigma_map
+from sl_calibration.solve.solution import Solution, metres_per_pixel
+from sl_calibration.solve.solution_pipeline import solve_rig, thinned
+from sl_calibration.solve.stages import solve_camera
 from sl_reconstruct.model.calibration_file import dump_calibration, parse_calibration
-from sl_reconstruct.model.rig import Device
-from support.calibration_scenes import CAMERA, HEIGHTS_M, PROJECTOR, Scene, grid, spoil, triangulate
+from sl_reconstruct.model.rig import Device, Rig
+from support.calibration_scenes import CAMERA, HEIGHTS_M, SENSORS, Scene, grid, spoil, triangulate
 
 SEEDS = 40
 VOLUME = Volume((-6e-3, -4.5e-3, -1e-3), (6e-3, 4.5e-3, 1e-3))
@@ -55,7 +45,7 @@ def point_errors(bundle: Bundle, scene: Scene, noise: np.ndarray | float = 0.0) 
     """Errors (N, 3) of triangulated points, in metres, with noise on camera u."""
     seen = scene.rig.camera.project(POINTS_M) + noise
     column = scene.rig.projector.project(POINTS_M)[:, 0]
-    return triangulate(rig_of(bundle), seen, column, POINTS_M) - POINTS_M
+    return triangulate(Rig(*bundle.state.devices), seen, column, POINTS_M) - POINTS_M
 
 
 @pytest.fixture(scope="module")
@@ -144,33 +134,33 @@ def test_the_stage_is_found_out(solved: list[Bundle]) -> None:
 
 
 @pytest.fixture(scope="module")
-def worst() -> tuple[RigSolution, Scene, list[np.ndarray], list[np.ndarray]]:
+def worst() -> tuple[Solution, Scene, list[np.ndarray], list[np.ndarray]]:
     """The whole way, with every fault of the issue at once."""
     scene = Scene(FAULTY, hole_noise_px=0.02, targets=(20, 15))
     holes, targets = scene.views(11)
     rng = np.random.default_rng(12)
     bad_holes = [spoil(view.pixels, 0.05, 0.5, rng) for view in holes]
     bad_targets = [spoil(view.projector_px, 0.05, 4.0, rng) for view in targets]
-    return solve_rig(holes, targets, CAMERA, PROJECTOR), scene, bad_holes, bad_targets
+    return solve_rig(holes, targets, SENSORS), scene, bad_holes, bad_targets
 
 
 def test_wrong_points_are_left_out(worst) -> None:  # type: ignore[no-untyped-def]
     solution, _, bad_holes, bad_targets = worst
     bad = np.concatenate([*bad_holes, *bad_targets])
     assert bad.sum() > 60
-    assert not solution.joint.used[bad].any()
+    assert not solution.bundle.used[bad].any()
     # 5 sigma leaves out 4 of a million good ones
-    assert (solution.joint.used[~bad]).mean() > 0.999
+    assert (solution.bundle.used[~bad]).mean() > 0.999
 
 
 def test_the_whole_way_ends_at_the_truth(worst) -> None:  # type: ignore[no-untyped-def]
     solution, scene, *_ = worst
-    errors = point_errors(solution.joint, scene)
+    errors = point_errors(solution.bundle, scene)
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 1.0e-6
     # residual vectors of two coordinates: sqrt(2) of the noise, to 4 / sqrt(2 N)
-    assert solution.joint.rms_px(0) == pytest.approx(0.02 * np.sqrt(2), rel=0.13)
-    assert solution.joint.rms_px(1) == pytest.approx(0.01 * np.sqrt(2), rel=0.08)
-    assert solution.joint.chi2 == pytest.approx(solution.joint.dof, rel=4 * np.sqrt(2 / 3700))
+    assert solution.bundle.rms_px(0) == pytest.approx(0.02 * np.sqrt(2), rel=0.13)
+    assert solution.bundle.rms_px(1) == pytest.approx(0.01 * np.sqrt(2), rel=0.08)
+    assert solution.bundle.chi2 == pytest.approx(solution.bundle.dof, rel=4 * np.sqrt(2 / 3700))
     search = solution.camera.search
     assert search.cost_after_px2 < search.cost_before_px2
 
@@ -186,13 +176,13 @@ def test_however_the_plate_lies(seed: int) -> None:
     holes, targets = scene.views(seed)
     for view in holes:
         spoil(view.pixels, 0.05, rng.choice([0.3, 3, 30]), rng)
-    errors = point_errors(solve_rig(holes, targets, CAMERA, PROJECTOR).joint, scene)
+    errors = point_errors(solve_rig(holes, targets, SENSORS).bundle, scene)
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 1.0e-6
 
 
 def test_the_worst_case_passes_the_gate(worst) -> None:  # type: ignore[no-untyped-def]
     solution, *_ = worst
-    figures = solution.figures()
+    figures = solution.figures
     verdict = judge(figures, Limits())
     assert verdict.passed, verdict.reasons
     # Where no lens is kept, its limit has nothing to limit.
@@ -238,9 +228,9 @@ def test_one_step_is_the_solution_without_the_height() -> None:
 def test_two_heights_leave_no_check() -> None:
     scene = Scene()
     holes, targets = scene.views(14, np.array([[0, 0, -1e-3], [0, 0, 1e-3]]))
-    solution = solve_rig(holes, targets, CAMERA, PROJECTOR)
+    solution = solve_rig(holes, targets, SENSORS)
     assert solution.left_out == ()
-    reasons = judge(solution.figures(), Limits()).reasons
+    reasons = judge(solution.figures, Limits()).reasons
     assert [reason.split()[0] for reason in reasons] == ["left_out_z_m"]
 
 
@@ -269,7 +259,7 @@ def test_squareness_is_told_from_tilt_when_x_and_y_move() -> None:
     scene = Scene(Mounting((1.0005, 0.9995, 1.001), (0.001, 0.0035, -0.002), (0.02, 0.03, 0.05)))
     places = np.array([[0, 0, -1], [0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0.0]]) * 1e-3
     holes, targets = scene.views(16, places)
-    report = solve_rig(holes, targets, CAMERA, PROJECTOR).joint.stage
+    report = solve_rig(holes, targets, SENSORS).bundle.stage
     true = scene.mounting.axes / np.linalg.norm(scene.mounting.axes, axis=0)
     angles = np.arcsin([true[:, 0] @ true[:, 1], true[:, 0] @ true[:, 2], true[:, 1] @ true[:, 2]])
     assert (np.abs(report.squareness_rad - angles) < 4 * report.squareness_sigma_rad).all()
@@ -303,9 +293,9 @@ def test_a_stage_that_does_not_repeat() -> None:
     holes, targets = scene.views(18, real)
     holes = [replace(view, stage_m=s) for view, s in zip(holes, told, strict=True)]
     targets = [replace(view, stage_m=s) for view, s in zip(targets, told, strict=True)]
-    trusted = solve_rig(holes, targets, CAMERA, PROJECTOR).joint
+    trusted = solve_rig(holes, targets, SENSORS).bundle
     loose = Freedom(StagePrior(position_sigma_m=1e-6))
-    known = solve_rig(holes, targets, CAMERA, PROJECTOR, loose).joint
+    known = solve_rig(holes, targets, SENSORS, loose).bundle
     assert trusted.scales[0] > 2
     assert known.scales.max() < 1.1
     errors = known.state.errors_m - (real - told)
@@ -330,9 +320,9 @@ def test_the_file_holds_it_all(solved: list[Bundle], worst) -> None:  # type: ig
     again = parse_calibration(dump_calibration(calibration))
     assert again.hash == calibration.hash
     assert again.covariance is not None
-    assert again.covariance.parameters == solution.joint.covariance.parameters
-    np.testing.assert_array_equal(again.covariance.matrix, solution.joint.covariance.matrix)
-    assert again.residuals["camera_rms_px"] == solution.joint.rms_px(0)
+    assert again.covariance.parameters == solution.bundle.covariance.parameters
+    np.testing.assert_array_equal(again.covariance.matrix, solution.bundle.covariance.matrix)
+    assert again.residuals["camera_rms_px"] == solution.bundle.rms_px(0)
 
 
 def test_sigma_map_spans_the_volume(solved: list[Bundle]) -> None:

@@ -1,4 +1,4 @@
-"""A calibration from its order to its folder, on a rig without devices; and every refusal."""
+"""A calibration from its request to its folder, on a rig without devices; and every refusal."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from sl_bench.world.surfaces import make_surface
 from sl_bench.world.world import World
 from sl_bringup.cli.calibrate import outcome_lines
 from sl_bringup.results.paper_tables import table_1_lines
+from sl_calibration.data.observations import load_observations
 from sl_calibration.data.run_store import CALIBRATION, OBSERVATIONS, Store
 from sl_calibration.data.session import (
     CalibrationProgress,
@@ -25,12 +26,11 @@ from sl_calibration.data.session import (
     Taken,
 )
 from sl_calibration.data.view_extraction import observe, white_image
-from sl_calibration.data.views import load_observations
-from sl_calibration.solve.uncertainty import Limits
+from sl_calibration.solve.acceptance import Limits
+from sl_calibration.solve.ray_midpoints import triangulate
 from sl_calibration.target.hole_detection import find_plate
 from sl_calibration.target.plate import DEFAULT_PLATE, Plate
-from sl_calibration.verify.verification import triangulate
-from sl_calibration.workflow.conclude import solve_stored
+from sl_calibration.workflow.conclusion import solve_stored
 from sl_common.errors import CalibrationError, DeviceRefused, SequenceError
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence, named
 from sl_reconstruct.model.calibration_file import load_calibration, rig_hash
@@ -180,8 +180,8 @@ def test_a_view_is_looked_at_while_the_next_is_taken() -> None:
         if progress.view == 2:
             moved_on.set()
 
-    order = CalibrationRequest("both", HEIGHTS_M, Plate(), "precise-rows")
-    assert Session(FakeRig(), order, look, tell).views() == tuple(PLACES)
+    request = CalibrationRequest("both", HEIGHTS_M, Plate(), "precise-rows")
+    assert Session(FakeRig(), request, look, tell).views() == tuple(PLACES)
 
 
 def test_a_device_that_fails_is_the_answer_and_the_stage_goes_back(bench: Bench) -> None:
@@ -205,8 +205,8 @@ MARKED = Plate(9, 7, 1e-3, 0.4e-3, origin_diameter_m=0.6e-3)
 
 def seen(white: NDArray[np.uint8]) -> None:
     black = np.full_like(white, 6)
-    order = CalibrationRequest("both", HEIGHTS_M, MARKED, "lit")
-    observe(Taken(np.stack([white, black]), LIT, 0.0), order)
+    request = CalibrationRequest("both", HEIGHTS_M, MARKED, "lit")
+    observe(Taken(np.stack([white, black]), LIT, 0.0), request)
 
 
 def test_a_dark_lamp_is_named() -> None:

@@ -5,15 +5,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sl_calibration.data.homography_prefilter import fits_plane
-from sl_calibration.data.observations import HoleView, TargetView
+from sl_calibration.bundle.outlier_rejection import fits_homography
+from sl_calibration.data.solver_input import HoleView, TargetView
 from sl_calibration.solve.image_centre_search import search_centre
-from sl_calibration.solve.linear import Sensor, cost_px2, linear_step
-from sl_calibration.solve.rig_solution import solve_rig
+from sl_calibration.solve.linear_step import Sensor, cost_px2, linear_step
+from sl_calibration.solve.solution_pipeline import solve_rig
 from sl_calibration.solve.stages import solve_camera, solve_projector
 from sl_common.errors import CalibrationError
 from sl_reconstruct.model.rig import Device, Division
-from support.calibration_scenes import CAMERA, HEIGHTS_M, PLATE_XY_M, PROJECTOR, RIG, Scene, spoil
+from support.calibration_scenes import (
+    CAMERA,
+    HEIGHTS_M,
+    PLATE_XY_M,
+    PROJECTOR,
+    RIG,
+    SENSORS,
+    Scene,
+    spoil,
+)
 
 WORLD_M = np.concatenate([np.column_stack([PLATE_XY_M, np.full(100, z)]) for z in HEIGHTS_M])
 DEVICES = pytest.mark.parametrize(
@@ -70,9 +79,9 @@ def test_screen_finds_gross_errors_and_spares_the_lens() -> None:
     rng = np.random.default_rng(4)
     view = np.repeat(np.arange(5), 100)
     pixels = RIG.camera.project(WORLD_M)
-    assert fits_plane(WORLD_M[:, :2], pixels, view).all()
+    assert fits_homography(WORLD_M[:, :2], pixels, view).all()
     bad = spoil(pixels, 0.05, 20.0, rng)
-    np.testing.assert_array_equal(fits_plane(WORLD_M[:, :2], pixels, view), ~bad)
+    np.testing.assert_array_equal(fits_homography(WORLD_M[:, :2], pixels, view), ~bad)
 
 
 def views(heights_m: list[float], holes: int = 100, noise_px: float = 0.01) -> list[HoleView]:
@@ -136,7 +145,7 @@ def test_a_projector_seen_at_one_height_is_refused() -> None:
 def test_a_rig_without_targets_is_refused() -> None:
     holes, _ = Scene().views(6)
     with pytest.raises(CalibrationError, match="projected targets"):
-        solve_rig(holes, [], CAMERA, PROJECTOR)
+        solve_rig(holes, [], SENSORS)
 
 
 @pytest.mark.parametrize(

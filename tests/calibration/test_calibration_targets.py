@@ -10,18 +10,18 @@ import cv2
 import numpy as np
 import pytest
 
-import sl_calibration.workflow.conclude
+import sl_calibration.workflow.conclusion
 from sl_bench.world.mounting import Mounting
 from sl_bringup.bag.bag_writer import new_bag
 from sl_bringup.bag.bags import message_class
 from sl_bringup.cli.main import main
 from sl_bringup.evaluation import calibrate_bag
 from sl_bringup.evaluation.calibrate_bag import solve_recorded
+from sl_calibration.bundle.parameters import lens_values
 from sl_calibration.data.run_store import CAMERA
-from sl_calibration.report.camera_file import load_kept
-from sl_calibration.solve.bundle_adjustment import lens_values
-from sl_calibration.solve.fixed_intrinsics import keep_of
-from sl_calibration.verify.verification import triangulate
+from sl_calibration.report.camera_file import load_fixed_lens
+from sl_calibration.solve.fixed_intrinsics import fixed_lens_of
+from sl_calibration.solve.ray_midpoints import triangulate
 from sl_common.errors import CalibrationError
 from sl_common.topics import CALIBRATION_RUN
 from sl_projector.sequence.pattern_sequence import named
@@ -41,7 +41,7 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     monkeypatch.setattr(calibrate_bag, "image_size", lambda _: RIG.camera.image_size)
     # The pages are looked at elsewhere; drawing them takes longer than all the rest.
     for name in ("write_report", "write_camera_report"):
-        monkeypatch.setattr(sl_calibration.workflow.conclude, name, lambda *_: None)
+        monkeypatch.setattr(sl_calibration.workflow.conclusion, name, lambda *_: None)
     return Bench(tmp_path / "calibrations")
 
 
@@ -109,7 +109,7 @@ def test_a_camera_comes_first_and_its_projector_next(bench: Bench) -> None:
     assert bench.store.current() is None
     assert camera.calibration_file.endswith(CAMERA)
     assert (camera.projector_rms_px, camera.hash) == (0.0, "")
-    kept = load_kept(Path(camera.calibration_file), "camera")
+    kept = load_fixed_lens(Path(camera.calibration_file), "camera")
     # 3.9 px of 16 912 is what five heights tell (docs/calibration.md); here with the stage's lean.
     assert abs(kept.values[0] - RIG.camera.focal_length_px[0]) < 5 * np.sqrt(kept.covariance[0, 0])
     rig = bench.calibrate(target="projector")
@@ -127,7 +127,7 @@ def test_a_projector_without_a_camera_is_refused_before_anything_moves(bench: Be
 def test_a_lens_of_another_kind_cannot_be_kept(bench: Bench, tmp_path: Path) -> None:
     camera = replace(RIG.camera, lens=BrownConrady((0.1, 0.0, 0.0, 0.0, 0.0)))
     with pytest.raises(CalibrationError, match="expected the paper's lens"):
-        keep_of(Calibration(Rig(camera, RIG.projector)), "camera", "a file")
+        fixed_lens_of(Calibration(Rig(camera, RIG.projector)), "camera", "a file")
     named = bench.calibrate(target="camera", keep=str(tmp_path / "missing.yaml"))
     assert "cannot read" in named.message
     assert bench.rig.moves == []
@@ -140,7 +140,9 @@ def test_a_camera_file_has_no_projector_to_keep(bench: Bench) -> None:
 
 
 def test_an_unknown_uncertainty_of_a_kept_lens_counts_as_none() -> None:
-    kept = keep_of(Calibration(RIG, Covariance(("camera.kappa",), np.eye(1))), "camera", "a file")
+    kept = fixed_lens_of(
+        Calibration(RIG, Covariance(("camera.kappa",), np.eye(1))), "camera", "a file"
+    )
     assert not kept.covariance.any()
 
 

@@ -13,10 +13,10 @@ import pytest
 import sl_calibration.workflow.calibrator
 from sl_calibration.data.run_store import Store
 from sl_calibration.data.session import CalibrationRequest, Taken
-from sl_calibration.solve.uncertainty import Limits
+from sl_calibration.solve.acceptance import Limits
 from sl_calibration.target.plate import Plate
-from sl_calibration.verify.verification import Check, VerifyLimits, check_on, default_heights
-from sl_calibration.workflow.calibrator import Calibrator, InForce, VerifyOutcome
+from sl_calibration.verify.rig_check import Check, VerifyLimits, check_on, default_heights
+from sl_calibration.workflow.calibrator import Calibrator, InForce, VerifyOutcome, VerifyRequest
 from sl_common.errors import CalibrationError
 from sl_reconstruct.model.calibration_file import Calibration
 from sl_reconstruct.model.rig import Device, Rig
@@ -50,9 +50,8 @@ class Checked:
         self, heights_m: tuple[float, ...] = HEIGHTS_M, target: str = "plate"
     ) -> VerifyOutcome:
         calibration = Calibration(self.rig_in_force, made_from=self.made_from)
-        return self.calibrator.verify(
-            self.rig, target, heights_m, Plate(), "precise-rows", InForce(calibration, "a file")
-        )
+        request = VerifyRequest(target, heights_m, Plate(), "precise-rows")
+        return self.calibrator.verify(self.rig, request, InForce(calibration, "a file"))
 
 
 @pytest.fixture

@@ -43,10 +43,10 @@ ROOMS = {
         "reconstruction": {"model", "cloud", "decode"},
     },
     "sl_calibration": {
-        "target": set(), "data": {"target"}, "verify": {"target", "data"},
-        "solve": {"data", "verify"}, "board": {"data", "solve"},
-        "report": {"data", "verify", "solve"},
-        "workflow": {"target", "data", "verify", "solve", "report"},
+        "target": set(), "data": {"target"}, "bundle": {"data"}, "solve": {"data", "bundle"},
+        "board": {"data", "solve"}, "verify": {"target", "data", "solve"},
+        "report": {"data", "bundle", "solve", "verify"},
+        "workflow": {"target", "data", "bundle", "solve", "verify", "report"},
     },
     "sl_bench": {
         "world": set(), "dlpc": set(), "camera": set(), "stage": set(),

@@ -24,7 +24,7 @@ from sl_interfaces.srv import Calibrate, Verify  # noqa: E402
 
 from sl_bench.process.bench_control import BenchControl  # noqa: E402
 from sl_bringup.graph.transport import Transport, process_environment  # noqa: E402
-from sl_calibration.verify.verification import triangulate  # noqa: E402
+from sl_calibration.solve.ray_midpoints import triangulate  # noqa: E402
 from sl_common import topics  # noqa: E402
 from sl_reconstruct.model.calibration_file import load_rig, parse_calibration, rig_hash  # noqa: E402
 from support.patience import PATIENCE_S, patience, wait  # noqa: E402

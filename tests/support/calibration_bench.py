@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sl_calibration.data.observations import View
 from sl_calibration.data.run_store import Store
 from sl_calibration.data.session import (
     CalibrationProgress,
@@ -17,11 +18,11 @@ from sl_calibration.data.session import (
     RunCancelled,
     Taken,
 )
-from sl_calibration.data.views import View
-from sl_calibration.solve.uncertainty import Limits
+from sl_calibration.solve.acceptance import Limits
 from sl_calibration.target.plate import Plate
-from sl_calibration.workflow.calibrator import Calibrator, InForce, Pitches
-from sl_calibration.workflow.conclude import Outcome
+from sl_calibration.workflow.calibrator import Calibrator, InForce
+from sl_calibration.workflow.conclusion import Outcome
+from sl_calibration.workflow.run_record import Pitches
 from sl_common.errors import CalibrationError
 from sl_projector.sequence.pattern_sequence import named
 from support.calibration_scenes import CAMERA, RIG, Scene
@@ -81,12 +82,12 @@ def look_with(
     scene = replace(scene or Scene(), hole_noise_px=noise_px)
     rng = np.random.default_rng(seed)
 
-    def look(taken: Taken, order: CalibrationRequest) -> View:
+    def look(taken: Taken, request: CalibrationRequest) -> View:
         height_m = taken.height_m if rig.plate_m is None else rig.plate_m
         stage_m = np.array([*taken.xy_m, height_m])
         holes, thrown = scene.holes(rng, stage_m), scene.thrown(rng, stage_m)
         ids = np.stack(np.meshgrid(range(10), range(10)), axis=-1).reshape(-1, 2)
-        few = slice(None) if order.patterns else slice(0)
+        few = slice(None) if request.patterns else slice(0)
         return View(
             taken.height_m, ids, holes.plate_xy_m, holes.pixels, holes.sigma_px[:, 0],
             thrown.camera_px[few], thrown.projector_px[few], thrown.sigma_px[few], 0.02,
@@ -115,8 +116,8 @@ class Bench:
         calibrator = Calibrator(
             self.store, limits or Limits(), PITCHES, look=look, record=self.runs.append
         )
-        order = CalibrationRequest(target, heights_m, Plate(), "precise-rows", travel_m)
-        outcome = calibrator.calibrate(self.rig, order, self.in_force, self.told.append, keep)
+        request = CalibrationRequest(target, heights_m, Plate(), "precise-rows", travel_m)
+        outcome = calibrator.calibrate(self.rig, request, self.in_force, self.told.append, keep)
         if outcome.accepted and outcome.calibration:
             self.in_force = InForce(outcome.calibration, outcome.calibration_file)
         return outcome

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from sl_bench.world.mounting import Mounting
 from sl_bench.world.reference_rig import reference_rig
-from sl_calibration.data.observations import HoleView, TargetView
-from sl_calibration.solve.linear import Sensor
+from sl_calibration.data.solver_input import HoleView, TargetView
+from sl_calibration.solve.linear_step import Sensor
 from sl_reconstruct.model.rig import Device, Rig
 
 Array = NDArray[np.float64]
@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 RIG = reference_rig()
 CAMERA = Sensor(RIG.camera.image_size, RIG.camera.pixel_pitch_m)
 PROJECTOR = Sensor(RIG.projector.image_size, RIG.projector.pixel_pitch_m)
+SENSORS = (CAMERA, PROJECTOR)
 HEIGHTS_M = np.linspace(-1e-3, 1e-3, 5)
 
 

@@ -22,11 +22,12 @@ from std_msgs.msg import String
 from sl_calibration.acquisition_node import GraphDevices
 from sl_calibration.data.run_store import Store, default_directory
 from sl_calibration.data.session import CalibrationProgress, CalibrationRequest
-from sl_calibration.solve.uncertainty import Limits
+from sl_calibration.solve.acceptance import Limits
 from sl_calibration.target.plate import DEFAULT_PLATE, Plate
-from sl_calibration.verify.verification import VerifyLimits
-from sl_calibration.workflow.calibrator import Calibrator, InForce, Pitches, VerifyOutcome
-from sl_calibration.workflow.conclude import Outcome
+from sl_calibration.verify.rig_check import VerifyLimits
+from sl_calibration.workflow.calibrator import Calibrator, InForce, VerifyOutcome, VerifyRequest
+from sl_calibration.workflow.conclusion import Outcome
+from sl_calibration.workflow.run_record import Pitches
 from sl_calibration.workflow.warm_up import warm_up_apart
 from sl_common import topics
 from sl_common.base_node import Health, RigNode, run
@@ -316,17 +317,14 @@ class CalibrationNode(RigNode):
 
     async def _serve_verify(self, request: Any, response: Any) -> Any:
         def work() -> VerifyOutcome:
-            plate = self._plate()
-            sequence = str(self._value("sequence"))
-            heights_m = tuple(float(h) for h in request.heights_m)
+            heights_m, sequence = tuple(map(float, request.heights_m)), str(self._value("sequence"))
+            asked = VerifyRequest(request.target or "plate", heights_m, self._plate(), sequence)
             in_force = self._stands()
             if in_force is None:
                 raise CalibrationError(f"nothing to verify: {self._fault}")
             self._await_compiler(self._shutting_down)
             with self._gear.in_use(self._shutting_down) as gear:
-                return self._calibrator.verify(
-                    gear, request.target or "plate", heights_m, plate, sequence, in_force
-                )
+                return self._calibrator.verify(gear, asked, in_force)
 
         outcome = await self.in_worker(lambda: self._alone(work, VerifyOutcome))
         for item in fields(VerifyOutcome):

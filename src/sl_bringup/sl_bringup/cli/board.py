@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     """Carry out ``slrig board``."""
     # Imported late: OpenCV and the solver are slow to import, and help needs neither.
     from sl_calibration.board.chessboard import Board, board_view, solve_board
-    from sl_calibration.solve.linear import Sensor
+    from sl_calibration.solve.linear_step import Sensor
     from sl_reconstruct.model.calibration_file import Calibration, save_calibration
 
     if not (args.square_mm > 0 and min(args.pitch_um) > 0):

@@ -16,7 +16,7 @@ from sl_common.documents import read_document
 from sl_common.errors import ConfigError
 
 if TYPE_CHECKING:
-    from sl_calibration.workflow.conclude import Outcome
+    from sl_calibration.workflow.conclusion import Outcome
 
 CLIENT = "sl_bringup.calibrate_node"
 INTERRUPTED = 130
@@ -181,7 +181,7 @@ def solve_again(source: Path, output: Path | None) -> int:
     """Solve a stored run, or the calibration in a recording, again; nothing is put in force."""
     from sl_bringup.evaluation.calibrate_bag import solve_recorded
     from sl_calibration.data.run_store import OBSERVATIONS
-    from sl_calibration.workflow.conclude import solve_stored
+    from sl_calibration.workflow.conclusion import solve_stored
 
     stored = source.suffix == ".npz" or (source / OBSERVATIONS).is_file()
     notes: list[str] = []

@@ -7,22 +7,21 @@ the calibration's node runs: same recording, same bits.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from sl_bringup.bag.bag_matching import decisions
 from sl_bringup.bag.bags import Bag, open_bag
 from sl_bringup.bag.recorded_settings import read_settings
+from sl_calibration.data.observations import Observations, View, save_observations
 from sl_calibration.data.run_store import OBSERVATIONS
 from sl_calibration.data.session import CalibrationRequest, Taken
 from sl_calibration.data.view_extraction import observe
-from sl_calibration.data.views import Observations, View, save_observations
-from sl_calibration.solve.uncertainty import Limits
+from sl_calibration.solve.acceptance import Limits
 from sl_calibration.target.plate import DEFAULT_PLATE, Plate
-from sl_calibration.workflow.calibrator import Pitches, made_from_order
-from sl_calibration.workflow.conclude import Outcome, conclude
+from sl_calibration.workflow.conclusion import Outcome, conclude
+from sl_calibration.workflow.run_record import Pitches, RunRecord, made_from_request
 from sl_camera.sync.matching import MatchedStack, StackMatcher, Status
 from sl_common.errors import CalibrationError
 from sl_common.topics import CALIBRATION_RUN
@@ -31,48 +30,13 @@ Look = Callable[[Taken, CalibrationRequest], View]
 Tell = Callable[[str], None]
 
 
-@dataclass(frozen=True)
-class Run:
-    """What a recording says about a calibration in it.
-
-    Parameters
-    ----------
-    scan_ids : tuple of int
-        Its stacks in order; empty: all that show both coordinates.
-    made_from : mapping
-        As the live run's calibration has it.
-    order : CalibrationRequest
-        What its views were taken for.
-    pitches : Pitches
-        Of the chips.
-    limits : Limits
-        Acceptance gate.
-    hash : str
-        Of the live run's calibration; empty where there was none.
-    """
-
-    scan_ids: tuple[int, ...]
-    made_from: Mapping[str, Any]
-    order: CalibrationRequest
-    pitches: Pitches
-    limits: Limits
-    hash: str = ""
-
-
-def _order(made_from: Mapping[str, Any]) -> CalibrationRequest:
-    """What the views of a run were taken for."""
-    plate = dict(made_from["plate"])
-    plate["origin_id"] = tuple(plate["origin_id"])
-    target = str(made_from.get("target", "both"))
-    patterns = target != "camera" or "kept" in made_from
-    sequence = str(made_from["sequence"])
-    return CalibrationRequest(target, (0.0,), Plate(**plate), sequence, patterns=patterns, least=1)
-
-
 def solve_recorded(
-    path: Path, output: Path, plate: Plate | None = None, look: Look = observe,
+    path: Path,
+    output: Path,
+    plate: Plate = DEFAULT_PLATE,
+    look: Look = observe,
     tell: Tell = lambda _: None,
-) -> tuple[Outcome, list[str]]:  # fmt: skip
+) -> tuple[Outcome, list[str]]:
     """Solve the last calibration in a recording again; nothing is put in force.
 
     Parameters
@@ -81,7 +45,7 @@ def solve_recorded(
         The recording.
     output : Path
         For observations, calibration and report.
-    plate : Plate, optional
+    plate : Plate
         Where the recording does not say what plate it was.
     look : callable
         Makes a view of a stack.
@@ -103,7 +67,7 @@ def solve_recorded(
         When it holds no calibration, not all its stacks, or they do not determine a rig.
     """
     with open_bag(path) as bag:
-        run = recorded_run(bag) or _assumed(plate or DEFAULT_PLATE)
+        run = _recorded_run(bag) or _assumed(plate)
         observations = _observations(bag, run, look, tell)
         notes = list(bag.lost)
     output.mkdir(parents=True, exist_ok=True)
@@ -112,26 +76,17 @@ def solve_recorded(
     return outcome, [*_compared(run, outcome), *notes]
 
 
-def recorded_run(bag: Bag) -> Run | None:
-    """Return the last run that the calibration's node told of; None where it told of none.
-
-    Raises
-    ------
-    CalibrationError
-        When it is not told as expected.
-    """
+def _recorded_run(bag: Bag) -> RunRecord | None:
+    """Last run that the calibration's node published; None where there is none."""
     if not bag.has(CALIBRATION_RUN):
         return None
     texts = [recorded.message.data for recorded in bag.messages(CALIBRATION_RUN, quick=True)]
     if not texts:
         return None
     try:
-        told = json.loads(texts[-1])
-        return Run(
-            tuple(int(number) for number in told["scan_ids"]), told["made_from"],
-            _order(told["made_from"]), Pitches(**told["pitches"]), Limits(**told["limits"]),
-            str(told["hash"]),
-        )  # fmt: skip
+        run = RunRecord.of_plain(json.loads(texts[-1]))
+        _ = run.request
+        return run
     except (ValueError, TypeError, KeyError) as error:
         raise CalibrationError(
             f"{bag.path}: what {CALIBRATION_RUN.name} tells cannot be used ({error!r}); expected "
@@ -139,19 +94,19 @@ def recorded_run(bag: Bag) -> Run | None:
         ) from error
 
 
-def _assumed(plate: Plate) -> Run:
+def _assumed(plate: Plate) -> RunRecord:
     """Run of a recording that tells of none: everything in it that shows both coordinates."""
-    order = CalibrationRequest("both", (0.0,), plate, "precise-rows", least=1)
-    made_from = {**made_from_order(order), "heights_m": []}
-    return Run((), made_from, order, Pitches(1e-5, 1e-5), Limits())
+    request = CalibrationRequest("both", (0.0,), plate, "precise-rows", least=1)
+    made_from = {**made_from_request(request), "heights_m": []}
+    return RunRecord((), made_from, Pitches(1e-5, 1e-5), Limits())
 
 
-def _observations(bag: Bag, run: Run, look: Look, tell: Tell) -> Observations:
+def _observations(bag: Bag, run: RunRecord, look: Look, tell: Tell) -> Observations:
     views: dict[int, View] = {}
     sizes = (0, 0), (0, 0)
     for stack in _stacks(bag, run):
         sizes = image_size(stack), stack.sequence.dmd_size
-        views[stack.scan_id] = look(_taken(stack), run.order)
+        views[stack.scan_id] = look(_taken(stack), run.request)
         tell(f"scan {stack.scan_id}: {len(views[stack.scan_id].hole_ids)} holes")
     if missing := [number for number in run.scan_ids if number not in views]:
         raise CalibrationError(
@@ -162,14 +117,13 @@ def _observations(bag: Bag, run: Run, look: Look, tell: Tell) -> Observations:
         raise CalibrationError(
             f"{bag.path} holds no stack with columns and rows; expected a recorded calibration"
         )
-    ordered = tuple(views[number] for number in run.scan_ids or sorted(views))
-    made_from = dict(run.made_from)
-    made_from["heights_m"] = made_from.get("heights_m") or sorted({v.height_m for v in ordered})
-    pitches = run.pitches
-    return Observations(ordered, *sizes, pitches.camera_m, pitches.projector_m, made_from)
+    ordered = [views[number] for number in run.scan_ids or sorted(views)]
+    heights = run.made_from.get("heights_m") or sorted({view.height_m for view in ordered})
+    run = replace(run, made_from={**run.made_from, "heights_m": heights})
+    return run.observations(ordered, *sizes)
 
 
-def _stacks(bag: Bag, run: Run) -> Iterator[MatchedStack]:
+def _stacks(bag: Bag, run: RunRecord) -> Iterator[MatchedStack]:
     """Yield the stacks of a run; their memory is used again afterwards."""
     matcher = StackMatcher(read_settings(bag).matching)
     for decision in decisions(bag, matcher):
@@ -198,7 +152,7 @@ def _taken(stack: MatchedStack) -> Taken:
     return Taken(stack.data, stack.sequence, z, (x, y), stack.scan_id)
 
 
-def _compared(run: Run, outcome: Outcome) -> list[str]:
+def _compared(run: RunRecord, outcome: Outcome) -> list[str]:
     if not run.scan_ids:
         return ["the recording does not tell of a calibration: all its stacks were taken"]
     if not run.hash:

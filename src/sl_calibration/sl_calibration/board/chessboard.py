@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sl_calibration.board.planar_target import MIN_VIEWS, FreePair, FreeSolution, solve_free_pair
 from sl_calibration.data.view_extraction import white_image
-from sl_calibration.solve.linear import Sensor
+from sl_calibration.solve.linear_step import Sensor
 from sl_common.errors import CalibrationError
 from sl_projector.sequence.pattern_sequence import AXES, Axis, PatternSequence
 from sl_reconstruct.model.rig import BrownConrady

@@ -1,7 +1,7 @@
 """Devices from a flat target held anyhow, OpenCV's way: the lens model of Brown and Conrady.
 
 For rigs without a stage: a board or dot plate in three or more unlike poses. The paper's model
-and the stage's knowledge are in `sl_calibration.solve.rig_solution`; here OpenCV does the work.
+and the stage's knowledge are in `sl_calibration.solve.solution`; here OpenCV does the work.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_calibration.solve.linear import Sensor
+from sl_calibration.solve.linear_step import Sensor
 from sl_common.errors import CalibrationError
 from sl_reconstruct.model.rig import BrownConrady, Device, Rig
 

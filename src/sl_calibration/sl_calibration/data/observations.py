@@ -1,179 +1,183 @@
-"""Observations as the solver wants them: one row per hole or target, all views joined.
+"""What a calibration is solved from, kept so that it can be solved again.
 
-The world is the plate as it lies when the stage reads zero: x and y in the plate, z along its
-normal towards the devices. `stage_m` is where the stage says it stands, relative to that zero.
+Nothing here is a result: plate coordinates that were given, pixels that were measured, heights
+that the stage told.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+from zlib import error as ZlibError  # noqa: N812
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from sl_common.documents import written_atomically
 from sl_common.errors import CalibrationError
 
 Array = NDArray[np.float64]
 
+FORMAT = 1
+#: Views are aside of each other when their x or y differ by this, metres.
+SAME_XY_M = 20e-6
+
 
 @dataclass(frozen=True)
-class HoleView:
-    """Holes of the plate, as a camera sees them at one stage position.
+class View:
+    """The plate at one height of the stage, seen by the camera and lit by the projector.
 
     Parameters
     ----------
-    stage_m : ndarray, (3,)
-        Stage position, metres; z up.
+    height_m : float
+        Stage z, as the stage tells it, metres.
+    hole_ids : ndarray, (N, 2), int
+        Column and row of each hole on the plate.
     plate_xy_m : ndarray, (N, 2)
         Where the holes are on the plate, metres.
-    pixels : ndarray, (N, 2)
-        Observed images (u, v) of the holes' centres, pixels.
-    sigma_px : float or ndarray, (N,) or (N, 2)
-        1-sigma of the coordinates, pixels.
-
-    Raises
-    ------
-    CalibrationError
-        When shapes do not fit or a number is not finite.
+    centres_px : ndarray, (N, 2)
+        Images of their centres, camera pixels.
+    centres_sigma_px : ndarray, (N,)
+        1-sigma of each coordinate.
+    camera_px : ndarray, (M, 2)
+        Camera pixels on the plate at which the projector's coordinates were decoded.
+    dmd_px : ndarray, (M, 2)
+        DMD column and row that light them.
+    dmd_sigma_px : ndarray, (M, 2)
+        Their 1-sigma.
+    edge_sigma_px : float
+        1-sigma of a single edge on this plate in this light, camera pixels.
+    xy_m : tuple of float
+        Stage x and y, as the stage tells them, metres.
     """
 
-    stage_m: Array
+    height_m: float
+    hole_ids: NDArray[np.int64]
     plate_xy_m: Array
-    pixels: Array
-    sigma_px: Array
+    centres_px: Array
+    centres_sigma_px: Array
+    camera_px: Array
+    dmd_px: Array
+    dmd_sigma_px: Array
+    edge_sigma_px: float = float("nan")
+    xy_m: tuple[float, float] = (0.0, 0.0)
 
-    def __post_init__(self) -> None:
-        _set(self, "stage_m", (3,))
-        _set(self, "plate_xy_m", (-1, 2))
-        _set(self, "pixels", (len(self.plate_xy_m), 2))
-        object.__setattr__(self, "sigma_px", _sigma(self.sigma_px, len(self.pixels)))
+    @property
+    def place(self) -> tuple[float, float, float]:
+        """Where the stage stood, metres."""
+        return (*self.xy_m, self.height_m)
 
 
 @dataclass(frozen=True)
-class TargetView:
-    """Points of a flat, as camera and projector name them at one stage position.
+class Observations:
+    """All views of a run, and what has to be known beside them.
 
     Parameters
     ----------
-    stage_m : ndarray, (3,)
-        Stage position, metres; z up.
-    camera_px : ndarray, (N, 2)
-        Camera pixels (u, v).
-    projector_px : ndarray, (N, 2)
-        DMD coordinates (column, row) decoded there, pixels.
-    sigma_px : float or ndarray, (N,) or (N, 2)
-        1-sigma of the DMD coordinates, DMD pixels; the camera's noise is to be included.
+    views : tuple of View
+        In the order in which they were taken.
+    camera_size, dmd_size : tuple of int
+        (width, height), pixels.
+    camera_pitch_m, dmd_pitch_m : float
+        Pixel pitch on the chips, metres; for reports in millimetres only.
+    made_from : mapping
+        Where, when and with what they were taken; plain values.
+    """
+
+    views: tuple[View, ...]
+    camera_size: tuple[int, int]
+    dmd_size: tuple[int, int]
+    camera_pitch_m: float
+    dmd_pitch_m: float
+    made_from: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def stage_m(self) -> list[Array]:
+        """Stage position (3,) of each view: z as it reads, x and y from where most views stood.
+
+        A stage whose x and y only tremble has not moved in them.
+        """
+        xy = np.array([view.xy_m for view in self.views])
+        aside = xy - np.median(xy, axis=0)
+        aside[np.abs(aside) < SAME_XY_M] = 0.0
+        return [np.array([*a, v.height_m]) for a, v in zip(aside, self.views, strict=True)]
+
+    @property
+    def holes(self) -> int:
+        """Holes of all views."""
+        return sum(len(view.hole_ids) for view in self.views)
+
+    @property
+    def targets(self) -> int:
+        """Projector targets of all views."""
+        return sum(len(view.camera_px) for view in self.views)
+
+
+def save_observations(path: Path, observations: Observations) -> None:
+    """Write a ``.npz`` in one step: arrays ``NAME_i`` of view i, and the rest as JSON ``about``."""
+    about = {
+        "format": FORMAT,
+        "views": len(observations.views),
+        **{k: v for k, v in vars(observations).items() if k != "views"},
+    }
+    arrays = {
+        f"{name}_{i}": np.asarray(value)
+        for i, view in enumerate(observations.views)
+        for name, value in asdict(view).items()
+    }
+    arrays["about"] = np.array(json.dumps(about))
+    with written_atomically(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def load_observations(path: Path) -> Observations:
+    """Read what `save_observations` wrote.
 
     Raises
     ------
     CalibrationError
-        When shapes do not fit or a number is not finite.
+        When the file is not one, or incomplete.
     """
-
-    stage_m: Array
-    camera_px: Array
-    projector_px: Array
-    sigma_px: Array
-
-    def __post_init__(self) -> None:
-        _set(self, "stage_m", (3,))
-        _set(self, "camera_px", (-1, 2))
-        _set(self, "projector_px", (len(self.camera_px), 2))
-        object.__setattr__(self, "sigma_px", _sigma(self.sigma_px, len(self.camera_px)))
-
-
-def _set(view: HoleView | TargetView, name: str, shape: tuple[int, ...]) -> None:
-    array = np.asarray(getattr(view, name), dtype=np.float64)
-    fits = array.ndim == len(shape) and all(
-        want in (-1, have) for want, have in zip(shape, array.shape, strict=True)
-    )
-    if not fits:
-        wanted = tuple("N" if n == -1 else n for n in shape)
-        raise CalibrationError(f"{name}.shape={array.shape}; expected {wanted}")
-    if not np.all(np.isfinite(array)):
-        raise CalibrationError(f"{name} holds a number that is not finite; expected measured ones")
-    object.__setattr__(view, name, array)
-
-
-def _sigma(value: ArrayLike, count: int) -> Array:
-    sigma = np.asarray(value, dtype=np.float64)
-    if sigma.shape == (count,):
-        sigma = sigma[:, np.newaxis]
-    if sigma.shape not in ((), (count, 1), (count, 2)):
-        raise CalibrationError(f"sigma_px.shape={sigma.shape}; expected () or ({count},) or x 2")
-    if not np.all((sigma > 0) & np.isfinite(sigma)):
-        raise CalibrationError("sigma_px holds numbers that are not positive; expected pixels")
-    return np.array(np.broadcast_to(sigma, (count, 2)))
-
-
-@dataclass(frozen=True)
-class Holes:
-    """All views of the plate, one row per hole.
-
-    ``points_m`` (N, 3) on the plate, ``stage_m`` (N, 3), ``view`` (N,) indices, ``pixels`` (N, 2),
-    ``sigma_px`` (N, 2).
-    """
-
-    points_m: Array
-    stage_m: Array
-    view: NDArray[np.intp]
-    pixels: Array
-    sigma_px: Array
-
-    @property
-    def nominal_m(self) -> Array:
-        """World points (N, 3) as a faultless stage would have them."""
-        return np.asarray(self.points_m + self.stage_m)
-
-    def part(self, rows: NDArray[np.bool_]) -> Holes:
-        """Only some rows."""
-        return Holes(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
-
-    @classmethod
-    def of(cls, views: Sequence[HoleView]) -> Holes:
-        """Join views."""
-        flat = [np.pad(view.plate_xy_m, ((0, 0), (0, 1))) for view in views]
-        return cls(
-            _join(flat, 3), *_stage(views),
-            _join([view.pixels for view in views], 2), _join([view.sigma_px for view in views], 2),
+    names = View.__dataclass_fields__
+    try:
+        with path.open("rb") as whole, np.load(whole, allow_pickle=False) as file:
+            about = json.loads(str(file["about"]))
+            _check_format(about, path)
+            views = [
+                {n: file[f"{n}_{i}"] for n in names if n != "xy_m" or f"{n}_{i}" in file}
+                for i in range(int(about["views"]))
+            ]
+        made = [_view(values) for values in views]
+        return Observations(
+            tuple(made), _size(about["camera_size"]), _size(about["dmd_size"]),
+            float(about["camera_pitch_m"]), float(about["dmd_pitch_m"]), about["made_from"],
         )  # fmt: skip
+    except CalibrationError:
+        raise
+    except (OSError, KeyError, ValueError, TypeError, EOFError, BadZipFile, ZlibError) as error:
+        raise CalibrationError(
+            f"{path} holds no observations ({error}); expected the observations.npz of a run"
+        ) from error
 
 
-@dataclass(frozen=True)
-class Targets:
-    """All projected targets, one row each.
-
-    ``camera_px`` (N, 2), ``stage_m`` (N, 3), ``view`` (N,) indices, ``pixels`` (N, 2) on the DMD,
-    ``sigma_px`` (N, 2).
-    """
-
-    camera_px: Array
-    stage_m: Array
-    view: NDArray[np.intp]
-    pixels: Array
-    sigma_px: Array
-
-    def part(self, rows: NDArray[np.bool_]) -> Targets:
-        """Only some rows."""
-        return Targets(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
-
-    @classmethod
-    def of(cls, views: Sequence[TargetView]) -> Targets:
-        """Join views."""
-        return cls(
-            _join([view.camera_px for view in views], 2), *_stage(views),
-            _join([view.projector_px for view in views], 2),
-            _join([view.sigma_px for view in views], 2),
-        )  # fmt: skip
+def _view(values: dict[str, Any]) -> View:
+    """View of its arrays; older files have no x and y."""
+    x, y = values.get("xy_m", (0.0, 0.0))
+    numbers = {name: float(values[name]) for name in ("height_m", "edge_sigma_px")}
+    return View(**{**values, **numbers, "xy_m": (float(x), float(y))})
 
 
-def _join(parts: Sequence[Array], width: int) -> Array:
-    return np.concatenate([np.empty((0, width)), *parts])
+def _check_format(about: Mapping[str, Any], path: Path) -> None:
+    if about.get("format") != FORMAT:
+        raise CalibrationError(
+            f"{path} is of format {about.get('format')}; expected format {FORMAT}"
+        )
 
 
-def _stage(views: Sequence[HoleView] | Sequence[TargetView]) -> tuple[Array, NDArray[np.intp]]:
-    """Stage position (N, 3) and view index (N,) of every row."""
-    counts = [len(view.sigma_px) for view in views]
-    stage = np.array([view.stage_m for view in views]).reshape(-1, 3)
-    return np.repeat(stage, counts, axis=0), np.repeat(np.arange(len(views)), counts)
+def _size(value: Any) -> tuple[int, int]:
+    width, height = value
+    return int(width), int(height)

@@ -16,7 +16,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_calibration.data.views import View
+from sl_calibration.data.observations import View
 from sl_calibration.target.plate import Plate
 from sl_common.errors import CalibrationError, SlError
 from sl_projector.sequence.pattern_sequence import PatternSequence

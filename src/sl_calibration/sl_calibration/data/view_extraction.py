@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sl_calibration.data.observations import View
 from sl_calibration.data.session import CalibrationRequest, Taken
-from sl_calibration.data.views import View
 from sl_calibration.target.hole_detection import find_plate
 from sl_common.errors import CalibrationError
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from sl_calibration.data.run_store import CAMERA_PAGE, CAMERA_REPORT, PAGE, REPORT
 from sl_calibration.report.report_pictures import camera_pictures, pictures
 from sl_calibration.report.table_1 import table_1
-from sl_calibration.solve.rig_solution import metres_per_pixel
+from sl_calibration.solve.solution import metres_per_pixel
 from sl_common.documents import write_text
 from sl_reconstruct.model.calibration_file import Calibration
 from sl_reconstruct.model.rig import Device, Division
 
 if TYPE_CHECKING:
-    from sl_calibration.solve.bundle_adjustment import Bundle
-    from sl_calibration.solve.pipeline import Solved, SolvedCamera
+    from sl_calibration.bundle.bundle_adjustment import Bundle
+    from sl_calibration.solve.solution import JudgedSolution
 
 Array = NDArray[np.float64]
 
@@ -52,14 +52,14 @@ FIGURES: Mapping[str, tuple[str, float, str]] = {
 }
 
 
-def write_report(folder: Path, solved: Solved, calibration: Calibration) -> None:
+def write_report(folder: Path, solved: JudgedSolution, calibration: Calibration) -> None:
     """Write ``report.json`` and ``report.html`` into a run's folder."""
     content = report_content(solved, calibration)
     write_json(folder / REPORT, content)
     write_text(folder / PAGE, _page(solved, content))
 
 
-def write_camera_report(folder: Path, solved: SolvedCamera) -> None:
+def write_camera_report(folder: Path, solved: JudgedSolution) -> None:
     """Write ``camera_report.json`` and ``camera_report.html`` of a camera alone."""
     content = common_content(solved)
     write_json(folder / CAMERA_REPORT, content)
@@ -88,7 +88,7 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def report_content(solved: Solved, calibration: Calibration) -> dict[str, Any]:
+def report_content(solved: JudgedSolution, calibration: Calibration) -> dict[str, Any]:
     """Everything that the report says, plain values."""
     return {
         **common_content(solved),
@@ -98,7 +98,7 @@ def report_content(solved: Solved, calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def common_content(solved: Solved | SolvedCamera) -> dict[str, Any]:
+def common_content(solved: JudgedSolution) -> dict[str, Any]:
     """What is said of a rig and of a camera alone."""
     bundle, verdict = solved.bundle, solved.verdict
     devices = {name: device_content(solved, i) for i, name in enumerate(solved.names)}
@@ -119,9 +119,9 @@ def common_content(solved: Solved | SolvedCamera) -> dict[str, Any]:
     }
 
 
-def device_content(solved: Solved | SolvedCamera, index: int) -> dict[str, Any]:
+def device_content(solved: JudgedSolution, index: int) -> dict[str, Any]:
     """One device with its sigmas, and the paper's own solution of it."""
-    joint, search = solved.bundle, solved.searches[index]
+    joint, search = solved.bundle, solved.solution.searches[index]
     device: Device = joint.state.devices[index]
     prefix = f"{solved.names[index]}."
     sigmas = {k.removeprefix(prefix): v for k, v in joint.sigmas.items() if k.startswith(prefix)}
@@ -149,9 +149,9 @@ def device_content(solved: Solved | SolvedCamera, index: int) -> dict[str, Any]:
     }
 
 
-def _heights(solved: Solved | SolvedCamera) -> list[dict[str, Any]]:
+def _heights(solved: JudgedSolution) -> list[dict[str, Any]]:
     """Residuals of each view, and its error when its height is left out."""
-    left_out = getattr(solved.solution, "left_out", ())
+    left_out = solved.solution.left_out
     left = {check.height_m: check.z_rms_m for check in left_out}
     rows = []
     for stage_m in solved.observations.stage_m:
@@ -176,7 +176,7 @@ def _view_residuals(bundle: Bundle, index: int, what: str, stage_m: Array) -> di
 # -- the page -------------------------------------------------------------------------------------
 
 
-def _page(solved: Solved, content: Mapping[str, Any]) -> str:
+def _page(solved: JudgedSolution, content: Mapping[str, Any]) -> str:
     title = f"Calibration of {content['made_from'].get('date', 'unknown date')}"
     parts = _head(title, content)
     parts += [picture(caption, image) for caption, image in pictures(solved)]

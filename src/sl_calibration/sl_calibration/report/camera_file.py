@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sl_calibration.solve.fixed_intrinsics import Kept, keep, keep_of
-from sl_calibration.solve.stages import DeviceSolution
+from sl_calibration.bundle.bundle_adjustment import Bundle
+from sl_calibration.bundle.parameters import FixedLens
+from sl_calibration.solve.fixed_intrinsics import fixed_lens, fixed_lens_of
 from sl_common.documents import (
     Fields,
     a_whole_number,
@@ -29,12 +30,21 @@ from sl_reconstruct.model.calibration_file import (
 _KEYS = ("format", "camera", "covariance", "residuals", "made_from")
 
 
-def save_camera(path: Path, solution: DeviceSolution, made_from: Mapping[str, Any]) -> None:
-    """Write a camera's file in one step."""
-    bundle = solution.bundle
+def save_camera(path: Path, bundle: Bundle, made_from: Mapping[str, Any]) -> None:
+    """Write a camera's file in one step.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    bundle : Bundle
+        Of the camera alone.
+    made_from : mapping
+        Plain values.
+    """
     document = {
         "format": FORMAT,
-        "camera": device_document(solution.device),
+        "camera": device_document(bundle.state.devices[0]),
         "covariance": covariance_document(bundle.covariance),
         "residuals": {"camera_rms_px": bundle.rms_px(0)},
         "made_from": dict(made_from),
@@ -42,7 +52,7 @@ def save_camera(path: Path, solution: DeviceSolution, made_from: Mapping[str, An
     write_text(path, dump_document(document))
 
 
-def load_kept(path: Path, name: str) -> Kept:
+def load_fixed_lens(path: Path, name: str) -> FixedLens:
     """Read the lens of one device: from a rig's calibration, or from a camera's file.
 
     Parameters
@@ -59,7 +69,7 @@ def load_kept(path: Path, name: str) -> Kept:
     """
     text = read_text(path, CalibrationError)
     if "\nprojector:" in text or not text.lstrip().startswith("format"):
-        return keep_of(load_calibration(path), name, str(path))
+        return fixed_lens_of(load_calibration(path), name, str(path))
     if name != "camera":
         raise CalibrationError(f"{path} holds a camera alone; expected a file with a {name}")
     document = parse_document(text, str(path), CalibrationError)
@@ -68,4 +78,4 @@ def load_kept(path: Path, name: str) -> Kept:
     if version != FORMAT:
         raise CalibrationError(f"{path} is of format {version}; expected format {FORMAT}")
     covariance = fields.get("covariance", a_covariance, None)
-    return keep("camera", fields.get("camera", a_device), covariance, str(path))
+    return fixed_lens("camera", fields.get("camera", a_device), covariance, str(path))

@@ -11,11 +11,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from sl_calibration.solve.rig_solution import metres_per_pixel
-from sl_calibration.solve.uncertainty import EdgeNoise, sigma_map
+from sl_calibration.solve.point_uncertainty import EdgeNoise, sigma_map
+from sl_calibration.solve.solution import metres_per_pixel
 
 if TYPE_CHECKING:
-    from sl_calibration.solve.pipeline import Solved, SolvedCamera
+    from sl_calibration.solve.solution import JudgedSolution
 
 Array = NDArray[np.float64]
 
@@ -38,9 +38,9 @@ def _figure(width: float, height: float) -> Figure:
     return Figure((width, height), dpi=DPI, layout="constrained")
 
 
-def pictures(solved: Solved) -> Iterator[tuple[str, bytes]]:
+def pictures(solved: JudgedSolution) -> Iterator[tuple[str, bytes]]:
     """Caption and PNG of every picture of the report, in its order."""
-    made: tuple[tuple[str, Callable[[Solved], Figure]], ...] = (
+    made: tuple[tuple[str, Callable[[JudgedSolution], Figure]], ...] = (
         ("Residuals at each height, on the part (the paper's Fig. 6)", residuals_by_height),
         ("Residual vectors", residual_vectors),
         ("Coverage: where holes and targets were measured", coverage),
@@ -51,9 +51,9 @@ def pictures(solved: Solved) -> Iterator[tuple[str, bytes]]:
         yield caption, png(draw(solved))
 
 
-def camera_pictures(solved: SolvedCamera) -> Iterator[tuple[str, bytes]]:
+def camera_pictures(solved: JudgedSolution) -> Iterator[tuple[str, bytes]]:
     """The same of a camera alone."""
-    made: tuple[tuple[str, Callable[[SolvedCamera], Figure]], ...] = (
+    made: tuple[tuple[str, Callable[[JudgedSolution], Figure]], ...] = (
         ("Residuals at each height, on the part (the paper's Fig. 6)", residuals_by_height),
         ("Residual vectors", residual_vectors),
         ("Coverage: where holes were measured", coverage),
@@ -62,7 +62,7 @@ def camera_pictures(solved: SolvedCamera) -> Iterator[tuple[str, bytes]]:
         yield caption, png(draw(solved))
 
 
-def _panels(solved: Solved | SolvedCamera, height: float) -> tuple[Figure, list[Any]]:
+def _panels(solved: JudgedSolution, height: float) -> tuple[Figure, list[Any]]:
     """Figure with axes for each device."""
     count = len(solved.names)
     figure = _figure(5.25 * count, height)
@@ -72,7 +72,7 @@ def _panels(solved: Solved | SolvedCamera, height: float) -> tuple[Figure, list[
 class _Group:
     """Holes or targets: where they are in their image, how far off, at which height."""
 
-    def __init__(self, solved: Solved | SolvedCamera, index: int) -> None:
+    def __init__(self, solved: JudgedSolution, index: int) -> None:
         joint = solved.bundle
         data = joint.problem.holes if index == 0 else joint.problem.targets
         rows = joint.used[joint.problem.groups[index]]
@@ -92,7 +92,7 @@ class _Group:
         return np.asarray(np.hypot(*self.residuals_px.T) * self.metres)
 
 
-def residuals_by_height(solved: Solved | SolvedCamera) -> Figure:
+def residuals_by_height(solved: JudgedSolution) -> Figure:
     """Every residual's length over the height, with the rms of each height and the noise floor."""
     figure, panels = _panels(solved, 3.6)
     for i, axes in enumerate(panels):
@@ -114,7 +114,7 @@ def residuals_by_height(solved: Solved | SolvedCamera) -> Figure:
     return figure
 
 
-def residual_vectors(solved: Solved | SolvedCamera) -> Figure:
+def residual_vectors(solved: JudgedSolution) -> Figure:
     """Residuals as arrows in both images, coloured by height."""
     figure, panels = _panels(solved, 4.6)
     for i, axes in enumerate(panels):
@@ -136,7 +136,7 @@ def residual_vectors(solved: Solved | SolvedCamera) -> Figure:
     return figure
 
 
-def coverage(solved: Solved | SolvedCamera) -> Figure:
+def coverage(solved: JudgedSolution) -> Figure:
     """Where both devices were measured, all heights together."""
     figure, panels = _panels(solved, 4.3)
     for i, axes in enumerate(panels):
@@ -155,12 +155,12 @@ def _image_axes(axes: Any, size: tuple[int, int]) -> None:
     axes.set(xlim=(0, size[0]), ylim=(size[1], 0), xlabel="u, px", ylabel="v, px", aspect="equal")
 
 
-def uncertainty(solved: Solved) -> Figure:
+def uncertainty(solved: JudgedSolution) -> Figure:
     """Maps of sigma z at the lowest, the middle and the highest height: calibration, with noise."""
-    solution = solved.solution
+    volume = solved.solution.lit_volume
     figure = _figure(11, 5.6)
-    from_calibration = sigma_map(solution.joint, solved.volume, EdgeNoise(0.0))
-    with_noise = sigma_map(solution.joint, solved.volume, solved.edge_noise)
+    from_calibration = sigma_map(solved.bundle, volume, EdgeNoise(0.0))
+    with_noise = sigma_map(solved.bundle, volume, solved.edge_noise)
     rows = ((from_calibration, "calibration"), (with_noise, "calibration and edge noise"))
     for line, ((grid, sigma), name) in zip(figure.subplots(2, 3), rows, strict=True):
         z_um = sigma[..., 2] * _UM
@@ -178,7 +178,7 @@ def uncertainty(solved: Solved) -> Figure:
     return figure
 
 
-def left_out(solved: Solved) -> Figure:
+def left_out(solved: JudgedSolution) -> Figure:
     """Error of z at each height when the calibration is made without it."""
     figure = _figure(6, 3)
     axes = figure.subplots()

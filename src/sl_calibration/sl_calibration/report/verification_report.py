@@ -11,7 +11,7 @@ from typing import Any
 from sl_calibration.data.run_store import PAGE, REPORT
 from sl_calibration.report.calibration_report import banner, page, picture, table, write_json
 from sl_calibration.report.report_pictures import off_planes, png
-from sl_calibration.verify.verification import Findings, VerifyLimits
+from sl_calibration.verify.rig_check import Findings, VerifyLimits
 from sl_common.documents import write_text
 
 #: What each figure is, the factor and the unit in which people read it.

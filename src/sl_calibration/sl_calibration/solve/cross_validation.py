@@ -12,14 +12,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_calibration.solve.bundle_adjustment import Bundle, State
-from sl_calibration.solve.derivatives import intersect, project
-from sl_calibration.solve.robust_lm import triangle
+from sl_calibration.bundle.bundle_adjustment import Bundle, rms
+from sl_calibration.bundle.covariance import triangle
+from sl_calibration.bundle.derivatives import intersect, project
+from sl_calibration.bundle.parameters import State
 
 Array = NDArray[np.float64]
 
 
-class LeftOut(NamedTuple):
+class HeightError(NamedTuple):
     """Errors at a height that the solution has not seen; NaN where there is nothing to compare.
 
     ``height_m`` of the stage; rms of holes (camera pixels), of targets (DMD pixels), and of the
@@ -32,29 +33,25 @@ class LeftOut(NamedTuple):
     z_rms_m: float
 
 
-def leave_heights_out(bundle: Bundle) -> tuple[LeftOut, ...]:
+def leave_heights_out(bundle: Bundle) -> tuple[HeightError, ...]:
     """Leave out each height in turn; empty for fewer than three heights, which leaves no check.
 
     Views aside (other x or y) are left out with their height, but not compared: what x and y
     travel does may be told by them alone.
     """
     problem = bundle.problem
-    both = (problem.holes.stage_m, problem.targets.stage_m)
-    heights = np.concatenate([stage_m[:, 2] for stage_m in both])
-    aside = np.concatenate([np.any(stage_m[:, :2], axis=1) for stage_m in both])
+    stage_m = np.concatenate([problem.holes.stage_m, problem.targets.stage_m])
+    heights, aside = stage_m[:, 2], np.any(stage_m[:, :2], axis=1)
     distinct = np.unique(heights)
     if len(distinct) < 3:
         return ()
-    residuals, jacobian = problem.evaluate(bundle.state)
-    for group, scale in zip(problem.groups, bundle.scales, strict=True):
-        residuals[group] /= scale
-        jacobian[group] /= scale
+    residuals, jacobian = bundle.linearised()
     prior, by_prior = problem.priors(bundle.state)
     found = []
     for height_m in distinct:
-        kept = bundle.used & (heights != height_m)
-        rows = np.concatenate([jacobian[kept].reshape(-1, problem.size), by_prior])
-        right = np.concatenate([residuals[kept].ravel(), prior])
+        others = bundle.used & (heights != height_m)
+        rows = np.concatenate([jacobian[others].reshape(-1, problem.size), by_prior])
+        right = np.concatenate([residuals[others].ravel(), prior])
         size = np.linalg.norm(rows, axis=0)
         size[size == 0] = 1.0  # x and y travel, where only this height tells of them
         small = triangle(np.column_stack([rows / size, right]))
@@ -65,31 +62,17 @@ def leave_heights_out(bundle: Bundle) -> tuple[LeftOut, ...]:
     return tuple(found)
 
 
-def _compare(bundle: Bundle, state: State, rows: NDArray[np.bool_], height_m: float) -> LeftOut:
+def _compare(bundle: Bundle, state: State, rows: NDArray[np.bool_], height_m: float) -> HeightError:
     problem = bundle.problem
     residuals, _ = problem.evaluate(state)
-    residuals *= np.concatenate([problem.holes.sigma_px, problem.targets.sigma_px])
-    hole_rms, target_rms = (_rms(residuals[group][rows[group]]) for group in problem.groups)
-    targets = rows[problem.groups[1]]
-    z_rms = _rms(height_errors(bundle, state)[targets, np.newaxis]) if targets.any() else np.nan
-    return LeftOut(height_m, hole_rms, target_rms, z_rms)
+    residuals *= problem.sigma_px
+    hole_rms, target_rms = (rms(residuals[group][rows[group]]) for group in problem.groups)
+    z_error = _height_errors(bundle, state)[rows[problem.groups[1]], np.newaxis]
+    return HeightError(height_m, hole_rms, target_rms, rms(z_error))
 
 
-def _rms(vectors: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1)))) if len(vectors) else np.nan
-
-
-def height_errors(bundle: Bundle, state: State | None = None) -> Array:
-    """Triangulated z of every target, by its column, less that of its plane, (N,) metres.
-
-    Parameters
-    ----------
-    bundle : Bundle
-        A joint solution.
-    state : State, optional
-        Another than the solution's.
-    """
-    state = state or bundle.state
+def _height_errors(bundle: Bundle, state: State) -> Array:
+    """Triangulated z of every target, by its column, less that of its plane, (N,) metres."""
     data = bundle.problem.targets
     normal, height, _ = bundle.problem.planes(state)
     hit = intersect(state.devices[0], data.camera_px, normal, height)

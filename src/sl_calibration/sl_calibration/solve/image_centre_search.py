@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from sl_calibration.solve.linear import Sensor, cost_px2, linear_step
+from sl_calibration.solve.linear_step import Sensor, cost_px2, linear_step
 from sl_common.errors import CalibrationError
 from sl_reconstruct.model.rig import Device
 

@@ -9,8 +9,9 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
-from sl_calibration.solve.bundle_adjustment import Bundle
+from sl_calibration.bundle.bundle_adjustment import Bundle
 from sl_common.errors import CalibrationError
 
 Array = NDArray[np.float64]
@@ -62,13 +63,14 @@ def check_views(stage_m: Array, view: NDArray[np.intp], what: str) -> None:
         )
 
 
-def check_determined(bundle: Bundle) -> None:
-    """Refuse a solution whose focal lengths, image centres or z travel the data leave open.
+def check_solution(bundle: Bundle) -> None:
+    """Refuse a solution that the data leave open, or with a device below the plate.
 
     Raises
     ------
     CalibrationError
-        With the predicted sigma, and the span of heights that would do.
+        With the predicted sigma of a focal length, an image centre or z travel, and the span of
+        heights that would do; or with where the device would be, as for a plate turned over.
     """
     span_mm = float(np.ptp(bundle.problem.positions_m[:, 2])) * 1e3
     for what, sigma, limit, unit in _sigmas(bundle):
@@ -78,6 +80,7 @@ def check_determined(bundle: Bundle) -> None:
                 f"{span_mm:.4g} mm; expected {limit:.2g} {unit} or better: heights over "
                 f"{1.1 * span_mm * sigma / limit:.2g} mm or more, or more holes"
             )
+    _check_side(bundle)
 
 
 def _sigmas(bundle: Bundle) -> Iterator[tuple[str, float, float, str]]:
@@ -95,14 +98,8 @@ def _sigmas(bundle: Bundle) -> Iterator[tuple[str, float, float, str]]:
         yield f"{name}'s image centre", centre, MAX_CENTRE_SIGMA * width, "px"
 
 
-def check_side(bundle: Bundle) -> None:
-    """Refuse devices below the plate: a plate turned over, or heights counted downwards.
-
-    Raises
-    ------
-    CalibrationError
-        Naming the device and where it would be.
-    """
+def _check_side(bundle: Bundle) -> None:
+    """Refuse devices below the plate: a plate turned over, or heights counted downwards."""
     for name, device in zip(bundle.problem.names, bundle.state.devices, strict=True):
         height_m = float(device.position_m[2])
         if height_m <= 0:
@@ -111,3 +108,20 @@ def check_side(bundle: Bundle) -> None:
                 "expected it in front: is the plate turned over, or do heights grow away from "
                 "the devices?"
             )
+
+
+def uncovered_part(pixels: Array, image_size: tuple[int, int]) -> float:
+    """Part of an image farther from any point than an eighth of its width.
+
+    Parameters
+    ----------
+    pixels : ndarray, (N, 2)
+        Points that were measured.
+    image_size : tuple of int
+        (width, height), pixels.
+    """
+    width, height = image_size
+    u, v = np.meshgrid(np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 25))
+    places = np.stack([u.ravel(), v.ravel()], axis=1)
+    distance, _ = KDTree(pixels).query(places)
+    return float(np.mean(distance > width / 8))

@@ -7,31 +7,25 @@ both refined together, with one covariance.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_calibration.data.homography_prefilter import fits_plane
-from sl_calibration.data.observations import Holes, HoleView, Targets, TargetView
-from sl_calibration.solve.bundle_adjustment import Bundle, Freedom, RigProblem, solve_bundle
-from sl_calibration.solve.derivatives import meet
+from sl_calibration.bundle.bundle_adjustment import Bundle, RigProblem, solve_bundle
+from sl_calibration.bundle.derivatives import meet
+from sl_calibration.bundle.outlier_rejection import fits_homography
+from sl_calibration.bundle.parameters import Freedom
+from sl_calibration.bundle.stage_model import FAULTLESS
+from sl_calibration.data.solver_input import Holes, HoleView, Targets, TargetView
 from sl_calibration.solve.image_centre_search import CentreSearch, search_centre
-from sl_calibration.solve.linear import Sensor, linear_step
-from sl_calibration.solve.observability import check_determined, check_side, check_views
-from sl_calibration.solve.stage_model import FAULTLESS
-from sl_common.errors import CalibrationError
-from sl_reconstruct.model.rig import Device, Rig
+from sl_calibration.solve.linear_step import Sensor
+from sl_calibration.solve.observability import check_solution, check_views
+from sl_calibration.solve.starts import solve_from_many_starts
+from sl_reconstruct.model.rig import Device
 
 Array = NDArray[np.float64]
-
-#: A start is good when it leads to residuals within so many stated sigmas; else others are tried.
-GOOD_SCALE = 3.0
-#: Image centres for further starts, in image sizes off the middle. A stage that leans by a degree
-#: looks to the paper's search like an image centre off by hundreds of pixels.
-_STARTS = np.array([[0, 0], [-0.3, -0.3], [0.3, 0.3], [-0.3, 0.3], [0.3, -0.3]])
 
 #: The search of the image centre takes the linear step a hundred times; it needs no more points.
 _SEARCH_POINTS = 2000
@@ -85,63 +79,21 @@ def solve_camera(
         When the views are degenerate, or nothing fits them.
     """
     holes = Holes.of(views)
-    check_views(holes.stage_m, holes.view, "holes")
-    good = fits_plane(holes.points_m[:, :2], holes.pixels, holes.view)
-    check_views(holes.stage_m[good], holes.view[good], "holes that fit a plane")
+    good = _prefiltered(holes.points_m[:, :2], holes, "holes")
     problem = RigProblem(("camera",), holes, Targets.of([]), freedom or Freedom())
-    bundle = _from_many_starts(problem, good, sensor)
-    check_determined(bundle)
-    check_side(bundle)
+    bundle = solve_from_many_starts(problem, good, sensor)
+    check_solution(bundle)
     used = bundle.used
     world_m = (holes.points_m + holes.stage_m @ bundle.state.axes.T)[used]
     return DeviceSolution(search_centre(world_m, holes.pixels[used], sensor), bundle)
 
 
-def _from_many_starts(problem: RigProblem, good: NDArray[np.bool_], sensor: Sensor) -> Bundle:
-    """Bundle from the paper's solution; from others where that leads nowhere."""
-    best: Bundle | None = None
-    refusal = CalibrationError("no start was found")
-    for device in _starts(problem.holes.part(good), sensor):
-        try:
-            found = solve_bundle(problem, problem.start(device))
-        except CalibrationError as error:
-            refusal = error
-            continue
-        if best is None or found.misfit < best.misfit:
-            best = found
-        if best.scales.max() < GOOD_SCALE:
-            break
-    if best is None:
-        raise refusal
-    return best
-
-
-def _starts(holes: Holes, sensor: Sensor) -> Iterator[Device]:
-    """Yield the paper's solution, first or last: it is good where the stage is as the paper's."""
-    points = holes.nominal_m
-    search = search_centre(points, holes.pixels, sensor)
-    noise_px2 = float(np.sum(holes.sigma_px**2))
-    faultless = search.cost_after_px2 < GOOD_SCALE**2 * noise_px2
-    if faultless:
-        yield search.device
-    size = np.array(sensor.image_size)
-    for off in _STARTS:
-        with suppress(CalibrationError):
-            yield linear_step(points, holes.pixels, (size - 1) / 2 + off * size, sensor)
-    if not faultless:
-        yield search.device
-
-
-def world_points(targets: Targets, camera: Device, axes: Array) -> Array:
-    """Where the camera's rays meet the plate's plane at each height, (N, 3) metres.
-
-    ``axes`` (3, 3) is the stage's A, from the camera's bundle. The patterns are taken to fall on
-    the plate (or on a flat in its place); where the flat is another, the joint refinement finds
-    its offset and slopes.
-    """
-    heights = (targets.stage_m @ axes.T)[:, 2]
-    normal = np.array([0.0, 0.0, 1.0])
-    return meet(camera, targets.camera_px, normal, heights)
+def _prefiltered(plane: Array, data: Holes | Targets, what: str) -> NDArray[np.bool_]:
+    """Points that fit a homography of their view; refuses views that leave parameters open."""
+    check_views(data.stage_m, data.view, what)
+    good = fits_homography(plane, data.pixels, data.view)
+    check_views(data.stage_m[good], data.view[good], f"{what} that fit a plane")
+    return good
 
 
 def solve_projector(
@@ -177,10 +129,10 @@ def solve_projector(
         When the views are degenerate, or nothing fits them.
     """
     targets = Targets.of(views)
-    check_views(targets.stage_m, targets.view, "projected targets")
-    good = fits_plane(targets.camera_px, targets.pixels, targets.view)
-    check_views(targets.stage_m[good], targets.view[good], "projected targets that fit a plane")
-    points = world_points(targets, camera, axes)
+    good = _prefiltered(targets.camera_px, targets, "projected targets")
+    # where the rays meet the plate's plane; the joint solution finds where the flat is another
+    heights = (targets.stage_m @ axes.T)[:, 2]
+    points = meet(camera, targets.camera_px, np.array([0.0, 0.0, 1.0]), heights)
     good &= np.isfinite(points).all(axis=1)
     few = np.flatnonzero(good)
     few = few[:: 1 + len(few) // _SEARCH_POINTS]
@@ -190,8 +142,7 @@ def solve_projector(
         ("projector",), seen, Targets.of([]), Freedom(FAULTLESS, None, square_pixels)
     )
     bundle = solve_bundle(problem, problem.start(search.device))
-    check_determined(bundle)
-    check_side(bundle)
+    check_solution(bundle)
     return DeviceSolution(search, bundle)
 
 
@@ -228,12 +179,5 @@ def solve_joint(
     )
     start = problem.start(camera.device, projector.device)
     bundle = solve_bundle(problem, start._replace(axes=camera.bundle.state.axes))
-    check_determined(bundle)
-    check_side(bundle)
+    check_solution(bundle)
     return bundle
-
-
-def rig_of(bundle: Bundle) -> Rig:
-    """Return the rig of a joint solution."""
-    camera, projector = bundle.state.devices
-    return Rig(camera, projector)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from sl_calibration.target.blobs import Blobs, find_blobs
 from sl_calibration.target.hole_fit import HoleFits, fit_holes
+from sl_calibration.target.hole_identification import FoundLattice, place
 from sl_calibration.target.lattice import Lattice, find_lattice
-from sl_calibration.target.marker_identification import FoundLattice, place
 from sl_calibration.target.plate import HoleFlag, Ids, Plate, PlateView
 from sl_calibration.target.plate_map import OUTLIER_SIGMAS, LocalMap, PlateMap, fit_map, map_circles
 from sl_common.errors import CalibrationError

@@ -1,16 +1,16 @@
-"""A calibration from its order to its verdict and its folder. No ROS here."""
+"""A calibration, or a check of the one in force, from its request to its folder. No ROS here."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
-from importlib import metadata
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from sl_calibration.bundle.parameters import FixedLens
+from sl_calibration.data.observations import View, save_observations
 from sl_calibration.data.run_store import OBSERVATIONS, PAGE, Store
 from sl_calibration.data.session import (
     CalibrationDevices,
@@ -23,13 +23,12 @@ from sl_calibration.data.session import (
     check_motion,
 )
 from sl_calibration.data.view_extraction import observe
-from sl_calibration.data.views import Observations, View, save_observations
-from sl_calibration.report.camera_file import load_kept
+from sl_calibration.report.camera_file import load_fixed_lens
 from sl_calibration.report.verification_report import write_verify_report
-from sl_calibration.solve.fixed_intrinsics import Kept, keep_of, other_than
-from sl_calibration.solve.uncertainty import Limits, judge
+from sl_calibration.solve.acceptance import Limits, judge
+from sl_calibration.solve.fixed_intrinsics import fixed_lens_of
 from sl_calibration.target.plate import Plate
-from sl_calibration.verify.verification import (
+from sl_calibration.verify.rig_check import (
     Check,
     Findings,
     VerifyLimits,
@@ -38,20 +37,12 @@ from sl_calibration.verify.verification import (
     default_heights,
     stage_z_axis,
 )
-from sl_calibration.workflow.conclude import Outcome, conclude
+from sl_calibration.workflow.conclusion import Outcome, conclude
+from sl_calibration.workflow.run_record import Pitches, RunRecord, made_from_request
 from sl_common.errors import CalibrationError, SlError
 from sl_reconstruct.model.calibration_file import Calibration
 
 NAN = float("nan")
-_NO_SIDE = "not checked: no mark of this plate tells its face from its back"
-
-
-@dataclass(frozen=True)
-class Pitches:
-    """Pixel pitches of the chips, metres; they only turn pixels into millimetres in reports."""
-
-    camera_m: float
-    projector_m: float
 
 
 @dataclass(frozen=True)
@@ -71,6 +62,19 @@ class VerifyOutcome:
     pitch_error: float = NAN
     step_m: float = NAN
     z_scale_error: float = NAN
+
+
+class VerifyRequest(NamedTuple):
+    """A check that is asked for.
+
+    ``target``, "plate" or "flat", lies on the stage; ``heights_m`` of the stage, empty for three
+    among those of the calibration; ``plate``, where it is one; ``sequence`` of both axes.
+    """
+
+    target: str
+    heights_m: tuple[float, ...]
+    plate: Plate
+    sequence: str
 
 
 @dataclass(frozen=True)
@@ -121,8 +125,8 @@ class Calibrator:
 
     def calibrate(
         self,
-        gear: CalibrationDevices,
-        order: CalibrationRequest,
+        devices: CalibrationDevices,
+        request: CalibrationRequest,
         in_force: InForce | None,
         tell: Tell,
         keep: str = "",
@@ -131,9 +135,9 @@ class Calibrator:
 
         Parameters
         ----------
-        gear : CalibrationDevices
-            The devices.
-        order : CalibrationRequest
+        devices : CalibrationDevices
+            Stage, projector and camera.
+        request : CalibrationRequest
             What is asked for.
         in_force : InForce or None
             Calibration in force: the device that is not asked for keeps its lens of it.
@@ -148,26 +152,26 @@ class Calibrator:
             Never an `SlError`: what went wrong is its message.
         """
         try:
-            kept = self._kept(order.target, in_force, keep)
+            fixed = self._fixed_lens(request.target, in_force, keep)
             # Without a projector to be kept, a camera needs no patterns.
-            order = replace(order, patterns=order.target != "camera" or kept is not None)
-            return self._run(gear, order, kept, tell)
+            request = replace(request, patterns=request.target != "camera" or fixed is not None)
+            return self._run(devices, request, fixed, tell)
         except RunCancelled as error:
             stays = "the calibration in force stays" if in_force else "nothing is in force"
             return Outcome(f"{error}; stage and projector were stopped, {stays}", cancelled=True)
         except SlError as error:
             return Outcome(str(error))
 
-    def _kept(self, target: str, in_force: InForce | None, keep: str) -> Kept | None:
+    def _fixed_lens(self, target: str, in_force: InForce | None, keep: str) -> FixedLens | None:
         """Lens of the device that is not asked for; None where both are, or there is none yet."""
         if target == "both":
             return None
-        name = other_than(target)
+        name = "projector" if target == "camera" else "camera"
         waiting = self._store.camera() if name == "camera" else None
         if keep or waiting:
-            return load_kept(Path(keep) if keep else Path(waiting or ""), name)
+            return load_fixed_lens(Path(keep) if keep else Path(waiting or ""), name)
         if in_force:
-            return keep_of(in_force.calibration, name, in_force.source)
+            return fixed_lens_of(in_force.calibration, name, in_force.source)
         if target == "projector":
             raise CalibrationError(
                 "target='projector', but no calibrated camera is in force or named; expected one: "
@@ -176,7 +180,11 @@ class Calibrator:
         return None
 
     def _run(
-        self, gear: CalibrationDevices, order: CalibrationRequest, kept: Kept | None, tell: Tell
+        self,
+        devices: CalibrationDevices,
+        request: CalibrationRequest,
+        fixed: FixedLens | None,
+        tell: Tell,
     ) -> Outcome:
         stacks: list[Taken] = []
 
@@ -186,26 +194,22 @@ class Calibrator:
             stacks.append(replace(taken, images=np.empty((0, *taken.images.shape[1:]))))
             return view
 
-        order, refused = _within_travel(gear, order)
-        made_from = {**made_from_order(order, kept), **refused}
+        request, refused = _within_travel(devices, request)
+        made_from = {**made_from_request(request, fixed), **refused}
+        run = RunRecord((), made_from, self._pitches, self._limits)
         try:
-            session = Session(gear, order, look, tell, self._stage_tolerance_m, check_motion)
+            session = Session(devices, request, look, tell, self._stage_tolerance_m, check_motion)
             views = session.views()
-            outcome = self._solved(views, stacks[0], made_from, tell)
+            outcome = self._solved(views, stacks[0], run, tell)
         except SlError as error:
-            self._note(stacks, made_from, Outcome(str(error)))
+            self._publish(run, stacks, Outcome(str(error)))
             raise
-        self._note(stacks, made_from, outcome)
+        self._publish(run, stacks, outcome)
         return outcome
 
-    def _solved(
-        self, views: tuple[View, ...], stack: Taken, made_from: Mapping[str, Any], tell: Tell
-    ) -> Outcome:
+    def _solved(self, views: tuple[View, ...], stack: Taken, run: RunRecord, tell: Tell) -> Outcome:
         height, width = stack.images.shape[1:]
-        observations = Observations(
-            views, (width, height), stack.sequence.dmd_size, self._pitches.camera_m,
-            self._pitches.projector_m, made_from,
-        )  # fmt: skip
+        observations = run.observations(views, (width, height), stack.sequence.dmd_size)
         folder = self._store.new_run()
         save_observations(folder / OBSERVATIONS, observations)
         tell(CalibrationProgress("solve", len(views), len(views), 0.85))
@@ -217,43 +221,26 @@ class Calibrator:
         tell(CalibrationProgress("store", len(views), len(views), 1.0))
         return outcome
 
-    def _note(self, stacks: list[Taken], made_from: Mapping[str, Any], outcome: Outcome) -> None:
+    def _publish(self, run: RunRecord, stacks: list[Taken], outcome: Outcome) -> None:
         """Say what it takes to make the run again from a recording of it."""
         if stacks:
-            self._record(
-                {
-                    "format": 1,
-                    "scan_ids": [stack.scan_id for stack in stacks],
-                    "made_from": dict(made_from),
-                    "pitches": asdict(self._pitches),
-                    "limits": asdict(self._limits),
-                    "accepted": outcome.accepted,
-                    "hash": outcome.hash,
-                    "message": outcome.message,
-                }
-            )
+            scan_ids = tuple(stack.scan_id for stack in stacks)
+            ended = {name: getattr(outcome, name) for name in ("accepted", "hash", "message")}
+            self._record(replace(run, scan_ids=scan_ids, **ended).plain)
 
     # -- verify -----------------------------------------------------------------------------------
 
     def verify(
-        self, gear: CalibrationDevices, target: str, heights_m: tuple[float, ...], plate: Plate,
-        sequence: str,
-        in_force: InForce,
-    ) -> VerifyOutcome:  # fmt: skip
+        self, devices: CalibrationDevices, request: VerifyRequest, in_force: InForce
+    ) -> VerifyOutcome:
         """Check the calibration in force on plate or flat; the stage goes back where it stood.
 
         Parameters
         ----------
-        gear : CalibrationDevices
-            The devices.
-        target : {"plate", "flat"}
-            What lies there.
-        heights_m : tuple of float
-            Stage heights; empty: three among those of the calibration.
-        plate : Plate
-            The plate, where it is one.
-        sequence : str
-            Patterns, both axes.
+        devices : CalibrationDevices
+            Stage, projector and camera.
+        request : VerifyRequest
+            What is asked for.
         in_force : InForce
             What is checked; it is not changed.
 
@@ -262,15 +249,16 @@ class Calibrator:
         SlError
             When the check cannot be made.
         """
+        target, heights_m, plate, sequence = request
         check_target(target)
         calibration = in_force.calibration
-        heights_m = heights_m or default_heights(calibration.made_from, gear.where()[2])
-        order = CalibrationRequest("both", heights_m, plate, sequence, least=1)
+        heights_m = heights_m or default_heights(calibration.made_from, devices.where()[2])
+        views = CalibrationRequest("both", heights_m, plate, sequence, least=1)
 
         def look(taken: Taken, _: CalibrationRequest) -> Check:
             return check_rig_on(taken, target, plate, calibration.rig)
 
-        checks = Session(gear, order, look, lambda _: None, self._stage_tolerance_m).views()
+        checks = Session(devices, views, look, lambda _: None, self._stage_tolerance_m).views()
         return self._judged(Findings(checks, stage_z_axis(calibration)), calibration.hash)
 
     def _judged(self, findings: Findings, calibration_hash: str) -> VerifyOutcome:
@@ -288,48 +276,28 @@ class Calibrator:
         folder = self._store.new_run("verify")
         write_verify_report(folder, findings, limits, message, not verdict.passed, calibration_hash)
         return VerifyOutcome(
-            message, True, not verdict.passed, limit_m=limits.rms_m, report=str(folder / PAGE),
-            views=count, z_scale_error=findings.z_scale_error, **findings.figures,
-        )  # fmt: skip
+            message,
+            success=True,
+            recalibrate=not verdict.passed,
+            limit_m=limits.rms_m,
+            report=str(folder / PAGE),
+            views=count,
+            z_scale_error=findings.z_scale_error,
+            **findings.figures,
+        )
 
 
 def _within_travel(
-    gear: CalibrationDevices, order: CalibrationRequest
+    devices: CalibrationDevices, request: CalibrationRequest
 ) -> tuple[CalibrationRequest, dict[str, str]]:
     """The request without the views aside where the stage cannot move so, and why it cannot."""
-    if not order.travel_m:
-        return order, {}
-    x, y, _ = gear.where()
+    if not request.travel_m:
+        return request, {}
+    x, y, _ = devices.where()
     try:
-        for dx, dy, z in order.places:
+        for dx, dy, z in request.places:
             if dx or dy:
-                gear.check((x + dx, y + dy, z))
+                devices.check((x + dx, y + dy, z))
     except SlError as error:
-        return replace(order, travel_m=0.0), {"not_square": f"squareness not measured: {error}"}
-    return order, {}
-
-
-def made_from_order(order: CalibrationRequest, kept: Kept | None = None) -> dict[str, Any]:
-    """Everything that a calibration is made from, plain values."""
-    return {
-        "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "target": order.target,
-        "heights_m": order.distinct,
-        "travel_m": order.travel_m,
-        "plate": asdict(order.plate),
-        "sequence": order.sequence,
-        "software": versions(),
-        **({"kept": kept.plain} if kept else {}),
-        **({} if order.plate.tells_its_back else {"plate_side": _NO_SIDE}),
-    }
-
-
-def versions() -> dict[str, str]:
-    """Versions of what computes a calibration."""
-    found = {}
-    for name in ("slrig", "numpy", "scipy", "opencv-python-headless", "numba"):
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "unknown"
-    return found
+        return replace(request, travel_m=0.0), {"not_square": f"squareness not measured: {error}"}
+    return request, {}

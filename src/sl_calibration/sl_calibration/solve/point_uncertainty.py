@@ -3,21 +3,17 @@
 A point X fulfils F(X, parameters) = observed, with F the camera's (u, v) and the projector's
 column (three equations, as `sl_reconstruct` solves them) or column and row (four). To first order
 ``dX = G (d observed - dF/d parameters d parameters)`` with G the (pseudo-)inverse of dF/dX.
-The acceptance gate, which needs it, is here as well.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
-from sl_calibration.solve.bundle_adjustment import Bundle
-from sl_calibration.solve.derivatives import project
+from sl_calibration.bundle.bundle_adjustment import Bundle
+from sl_calibration.bundle.derivatives import project
 
 Array = NDArray[np.float64]
 
@@ -109,76 +105,3 @@ def sigma_map(
     grid = volume.grid(shape)
     sigma = point_covariance(bundle, grid.reshape(-1, 3), noise).sigma_m
     return grid, sigma.reshape(grid.shape)
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Acceptance gate: the largest value of each figure.
-
-    Parameters
-    ----------
-    hole_rms_px, target_rms_px : float
-        Residuals of holes (camera pixels) and of targets (DMD pixels).
-    rejected_part : float
-        Part of holes or targets that were left out as wrong.
-    point_sigma_m : float
-        Predicted 1-sigma of z, from the calibration alone, worst in the volume, metres.
-    left_out_z_m : float
-        Rms error of z at a height that the calibration has not seen, worst height, metres.
-    stage_scale_error : float
-        True travel of z per metre read, off 1.
-    stage_lean_rad : float
-        Lean of z travel against the plate's normal, radians.
-    uncovered_part : float
-        Part of the camera's image farther from any hole than an eighth of its width.
-    kept_lens_sigmas : float
-        Where one device's lens is kept: how far it lies from the one that the run itself finds.
-    """
-
-    hole_rms_px: float = 0.1
-    target_rms_px: float = 0.1
-    rejected_part: float = 0.15
-    point_sigma_m: float = 1e-6
-    left_out_z_m: float = 2e-6
-    stage_scale_error: float = 0.01
-    stage_lean_rad: float = 0.1
-    uncovered_part: float = 0.5
-    kept_lens_sigmas: float = 6.0
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Whether a calibration may be put in force.
-
-    Parameters
-    ----------
-    passed : bool
-        All figures are known and within their limits.
-    reasons : tuple of str
-        For each figure that is not, what was found and what was expected.
-    figures : mapping
-        All that were judged.
-    """
-
-    passed: bool
-    reasons: tuple[str, ...]
-    figures: Mapping[str, float]
-
-
-def judge(figures: Mapping[str, float], limits: Any) -> Verdict:
-    """Hold figures, named as the limits are, against them; NaN is never within a limit."""
-    reasons = tuple(
-        f"{name} is {figures[name]:.3g}; expected at most {limit:.3g}"
-        for name, limit in asdict(limits).items()
-        if name in figures and not figures[name] <= limit
-    )
-    return Verdict(not reasons, reasons, dict(figures))
-
-
-def uncovered_part(pixels: Array, image_size: tuple[int, int]) -> float:
-    """Part of an image farther from any of (N, 2) pixels than an eighth of its width."""
-    width, height = image_size
-    u, v = np.meshgrid(np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 25))
-    places = np.stack([u.ravel(), v.ravel()], axis=1)
-    distance, _ = KDTree(pixels).query(places)
-    return float(np.mean(distance > width / 8))

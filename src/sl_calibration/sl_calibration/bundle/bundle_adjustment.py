@@ -9,110 +9,25 @@ when the stage reads zero, and its pitch, are the reference.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_calibration.data.observations import Holes, Targets
-from sl_calibration.solve.derivatives import (
-    PARAMETERS,
-    intersect,
-    kappa_of,
-    meet,
-    moved,
-    project,
-)  # fmt: skip
-from sl_calibration.solve.robust_lm import solve
-from sl_calibration.solve.stage_model import (
-    StagePrior,
-    StageReport,
-    axis_priors,
-    moving_axes,
-    stage_report,
-)  # fmt: skip
+from sl_calibration.bundle.derivatives import PARAMETERS, intersect, meet, moved, project
+from sl_calibration.bundle.parameters import Freedom, State, lens_values
+from sl_calibration.bundle.robust_lm import solve
+from sl_calibration.bundle.stage_model import StageReport, axis_priors, moving_axes, stage_report
+from sl_calibration.data.solver_input import Holes, Targets
 from sl_reconstruct.model.calibration_file import Covariance
 from sl_reconstruct.model.rig import Device
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class FlatPrior:
-    """How well the flat under the patterns is known against the plate, 1-sigma each.
-
-    Parameters
-    ----------
-    offset_sigma_m : float
-        Height of its surface over the plate's, at the world's origin, metres.
-    slope_sigma : float
-        Slope along x and y, metres per metre.
-    """
-
-    offset_sigma_m: float = 1e-3
-    slope_sigma: float = 0.05
-
-
-@dataclass(frozen=True)
-class HeldLens:
-    """The lens of a device that a solution is not to change.
-
-    Parameters
-    ----------
-    name : {"camera", "projector"}
-        The device.
-    values : ndarray, (4,)
-        Focal length (px), image centre (px, px), kappa (px^-2).
-    """
-
-    name: str
-    values: Array
-
-
-#: What a held lens may move by: millionths of what any calibration can tell.
-_HELD = np.array([1e-5, 1e-5, 1e-5, 1e-16])
-
-
-def lens_values(device: Device) -> Array:
-    """Focal length, image centre and kappa (4,) of a device with square pixels."""
-    return np.array([device.focal_length_px[0], *device.image_centre_px, kappa_of(device)])
-
-
-@dataclass(frozen=True)
-class Freedom:
-    """What the bundle estimates besides the devices.
-
-    Parameters
-    ----------
-    stage : StagePrior
-        How far the stage is trusted.
-    flat : FlatPrior or None
-        None where the patterns fall on the plate itself.
-    square_pixels : bool
-        One focal length (the paper's), or fx and fy.
-    held : HeldLens or None
-        The lens that stays as it is; for square pixels only.
-    """
-
-    stage: StagePrior = field(default_factory=StagePrior)
-    flat: FlatPrior | None = None
-    square_pixels: bool = True
-    held: HeldLens | None = None
-
-
-class State(NamedTuple):
-    """Everything that the bundle changes.
-
-    ``devices``: camera, or camera and projector; ``axes`` (3, 3), the stage's A; ``errors_m``
-    (K, 3) of its positions; ``flat``: offset (metres) and slopes along x and y.
-    """
-
-    devices: tuple[Device, ...]
-    axes: Array
-    errors_m: Array
-    flat: Array
+#: What a fixed lens may move by: millionths of what any calibration can tell.
+_FIXED_SIGMA = np.array([1e-5, 1e-5, 1e-5, 1e-16])
 
 
 @dataclass(frozen=True)
@@ -141,6 +56,11 @@ class RigProblem:
         """Holes and targets."""
         holes = len(self.holes.pixels)
         return slice(0, holes), slice(holes, holes + len(self.targets.pixels))
+
+    @property
+    def sigma_px(self) -> Array:
+        """Stated 1-sigma (M, 2) of holes, then targets."""
+        return np.concatenate([self.holes.sigma_px, self.targets.sigma_px])
 
     @cached_property
     def positions_m(self) -> Array:
@@ -202,7 +122,7 @@ class RigProblem:
         return tuple(names)
 
     def moved(self, state: State, step: Array) -> State:
-        """State after a step."""
+        """See `sl_calibration.bundle.robust_lm.Problem`."""
         axes = state.axes.copy()
         axes[:, list(self.moving)] += step[self.columns["axes"]].reshape(-1, 3).T
         errors = step[self.columns["errors"]].reshape(-1, 3)
@@ -211,10 +131,8 @@ class RigProblem:
             moved(device, self.device_step(step[self.columns[name]]))
             for name, device in zip(self.names, state.devices, strict=True)
         )
-        return State(
-            devices, axes, state.errors_m + errors if len(errors) else state.errors_m,
-            state.flat + flat if len(flat) else state.flat,
-        )  # fmt: skip
+        moved_errors = state.errors_m + errors if len(errors) else state.errors_m
+        return State(devices, axes, moved_errors, state.flat + flat if len(flat) else state.flat)
 
     def start(self, *devices: Device) -> State:
         """State with a faultless stage and the patterns on the plate's plane."""
@@ -311,10 +229,11 @@ class RigProblem:
         if flat is not None:
             sigma = np.array([flat.offset_sigma_m, flat.slope_sigma, flat.slope_sigma])
             parts.append((state.flat / sigma, np.diag(1 / sigma), self.columns["flat"]))
-        if held := self.freedom.held:
-            first = self.columns[held.name].start
-            values = (lens_values(state.devices[self.names.index(held.name)]) - held.values) / _HELD
-            parts.append((values, np.diag(1 / _HELD), slice(first, first + 4)))
+        if fixed := self.freedom.fixed:
+            first = self.columns[fixed.name].start
+            off = lens_values(state.devices[self.names.index(fixed.name)]) - fixed.values
+            scale = np.diag(1 / _FIXED_SIGMA)
+            parts.append((off / _FIXED_SIGMA, scale, slice(first, first + 4)))
         jacobian = np.zeros((sum(len(values) for values, _, _ in parts), self.size))
         row = 0
         for values, block, columns in parts:
@@ -376,8 +295,15 @@ class Bundle:
     @property
     def misfit(self) -> float:
         """Median length of all residuals in sigmas: what tells a right start from a wrong one."""
-        sigma = np.concatenate([self.problem.holes.sigma_px, self.problem.targets.sigma_px])
-        return float(np.median(np.hypot(*(self.residuals_px / sigma).T)))
+        return float(np.median(np.hypot(*(self.residuals_px / self.problem.sigma_px).T)))
+
+    def linearised(self) -> tuple[Array, Array]:
+        """Residuals (M, 2) and derivatives (M, 2, P) at the solution, in the enlarged sigmas."""
+        residuals, jacobian = self.problem.evaluate(self.state)
+        for group, scale in zip(self.problem.groups, self.scales, strict=True):
+            residuals[group] /= scale
+            jacobian[group] /= scale
+        return residuals, jacobian
 
     def residuals_of(self, group: int) -> Array:
         """Residuals (N, 2) of used holes (0) or targets (1), pixels."""
@@ -386,15 +312,30 @@ class Bundle:
 
     def rms_px(self, group: int) -> float:
         """Root mean square of the residual vectors' lengths; NaN for none."""
-        residuals = self.residuals_of(group)
-        return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))) if len(residuals) else np.nan
+        return rms(self.residuals_of(group))
+
+
+def rms(vectors: Array) -> float:
+    """Root mean square length of vectors (N, D); NaN for none."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1)))) if len(vectors) else np.nan
 
 
 def solve_bundle(problem: RigProblem, start: State) -> Bundle:
-    """Solve from a start; errors as in `sl_calibration.solve.robust_lm.solve`."""
+    """Solve from a start.
+
+    Parameters
+    ----------
+    problem : RigProblem
+        Observations and freedom.
+    start : State
+        Where to begin: `RigProblem.start`.
+
+    Raises
+    ------
+    CalibrationError
+        As `sl_calibration.bundle.robust_lm.solve`.
+    """
     state, fit = solve(problem, start)
-    sigma = np.concatenate([problem.holes.sigma_px, problem.targets.sigma_px])
-    return Bundle(
-        problem, state, Covariance(problem.parameters, fit.covariance),
-        fit.residuals * sigma, fit.used, fit.chi2, fit.dof, fit.scales,
-    )  # fmt: skip
+    covariance = Covariance(problem.parameters, fit.covariance)
+    residuals_px = fit.residuals * problem.sigma_px
+    return Bundle(problem, state, covariance, residuals_px, fit.used, fit.chi2, fit.dof, fit.scales)

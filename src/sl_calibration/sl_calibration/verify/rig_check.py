@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sl_calibration.data.session import CalibrationRequest, Taken
 from sl_calibration.data.view_extraction import MIN_TARGETS, check_target_light, observe
+from sl_calibration.solve.ray_midpoints import triangulate
 from sl_calibration.target.plate import Plate
 from sl_common.errors import CalibrationError
 from sl_reconstruct.model.calibration_file import Calibration
@@ -266,20 +267,6 @@ def _seen(taken: Taken) -> tuple[Array, Array]:
             f"least {MIN_TARGETS} on a flat"
         )
     return found.camera_px, found.dmd_px
-
-
-def triangulate(rig: Rig, camera_px: Array, dmd_px: Array) -> tuple[Array, Array]:
-    """Middles (N, 3) of the shortest lines between both rays, and their lengths (N,), metres."""
-    a, b = rig.camera.rays(camera_px), rig.projector.rays(dmd_px)
-    base = rig.projector.position_m - rig.camera.position_m
-    aa, ab, bb = (np.sum(p * q, axis=1) for p, q in ((a, a), (a, b), (b, b)))
-    ac, bc = a @ base, b @ base
-    scale = aa * bb - ab * ab
-    near_a = (ac * bb - ab * bc) / scale
-    near_b = (ab * ac - aa * bc) / scale
-    first = rig.camera.position_m + near_a[:, np.newaxis] * a
-    second = rig.projector.position_m + near_b[:, np.newaxis] * b
-    return 0.5 * (first + second), np.linalg.norm(first - second, axis=1)
 
 
 def _plane(points: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""From a run's observations to its verdict and its folder: the same live, from a folder, a bag."""
+"""A run's observations solved, judged and written to its folder: live, stored or recorded."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from sl_calibration.data.observations import Observations, load_observations
 from sl_calibration.data.run_store import CALIBRATION, CAMERA, CAMERA_PAGE, OBSERVATIONS, PAGE
 from sl_calibration.data.session import CalibrationProgress, Tell
-from sl_calibration.data.views import Observations, load_observations
 from sl_calibration.report.calibration_report import write_camera_report, write_report
 from sl_calibration.report.camera_file import save_camera
-from sl_calibration.solve.bundle_adjustment import Bundle
-from sl_calibration.solve.pipeline import Solved, SolvedCamera, solve, solve_camera_alone
-from sl_calibration.solve.rig_solution import metres_per_pixel
-from sl_calibration.solve.uncertainty import Limits
+from sl_calibration.solve.acceptance import Limits
+from sl_calibration.solve.solution import JudgedSolution, metres_per_pixel
+from sl_calibration.solve.solution_pipeline import solve, solve_camera_alone
 from sl_common.errors import CalibrationError
 from sl_reconstruct.model.calibration_file import Calibration, save_calibration
 
@@ -88,19 +87,13 @@ def _conclude_rig(observations: Observations, limits: Limits, folder: Path, tell
     save_calibration(folder / CALIBRATION, calibration)
     tell(CalibrationProgress("store", count, count, 0.95))
     write_report(folder, solved, calibration)
-    return _rig_outcome(solved, calibration, folder)
-
-
-def _rig_outcome(solved: Solved, calibration: Calibration, folder: Path) -> Outcome:
-    joint, rig = solved.bundle, solved.solution.rig
-    projector_px = joint.rms_px(1)
-    accepted = solved.verdict.passed
+    accepted, projector_px = solved.verdict.passed, solved.bundle.rms_px(1)
     return Outcome(
         message=_message(solved),
         success=accepted,
         accepted=accepted,
         projector_rms_px=projector_px,
-        projector_rms_m=projector_px * metres_per_pixel(rig.projector),
+        projector_rms_m=projector_px * metres_per_pixel(calibration.rig.projector),
         predicted_sigma_m=solved.predicted_sigma_m,
         left_out_rms_m=solved.left_out_rms_m,
         calibration_file=str(folder / CALIBRATION),
@@ -111,9 +104,9 @@ def _rig_outcome(solved: Solved, calibration: Calibration, folder: Path) -> Outc
     )
 
 
-def _camera_figures(solved: Solved | SolvedCamera) -> dict[str, Any]:
+def _camera_figures(solved: JudgedSolution) -> dict[str, Any]:
     """Figures of an outcome that holes and stage have."""
-    bundle: Bundle = solved.bundle
+    bundle = solved.bundle
     camera_px, stage = bundle.rms_px(0), bundle.stage
     return {
         "camera_rms_px": camera_px,
@@ -126,7 +119,7 @@ def _camera_figures(solved: Solved | SolvedCamera) -> dict[str, Any]:
     }
 
 
-def _message(solved: Solved) -> str:
+def _message(solved: JudgedSolution) -> str:
     if not solved.verdict.passed:
         return "not accepted, the calibration in force stays: " + "; ".join(solved.verdict.reasons)
     figures = solved.verdict.figures
@@ -146,7 +139,7 @@ def _message(solved: Solved) -> str:
 def _conclude_camera(observations: Observations, limits: Limits, folder: Path) -> Outcome:
     """Solve the camera alone; its file and page stand beside those of a rig, if there are any."""
     solved = solve_camera_alone(observations, limits)
-    save_camera(folder / CAMERA, solved.solution, observations.made_from)
+    save_camera(folder / CAMERA, solved.bundle, observations.made_from)
     write_camera_report(folder, solved)
     accepted = solved.verdict.passed
     message = (
@@ -156,10 +149,14 @@ def _conclude_camera(observations: Observations, limits: Limits, folder: Path) -
         else "not accepted: " + "; ".join(solved.verdict.reasons)
     )
     return Outcome(
-        message=message, success=accepted, accepted=accepted, camera_alone=accepted,
-        calibration_file=str(folder / CAMERA), report=str(folder / CAMERA_PAGE),
+        message=message,
+        success=accepted,
+        accepted=accepted,
+        camera_alone=accepted,
+        calibration_file=str(folder / CAMERA),
+        report=str(folder / CAMERA_PAGE),
         **_camera_figures(solved),
-    )  # fmt: skip
+    )
 
 
 def _camera_beside(rig: Outcome, camera: Outcome) -> Outcome:

@@ -1,0 +1,1 @@
+"""Bundle adjustment: parameters, their derivatives, robust least squares, covariance."""
