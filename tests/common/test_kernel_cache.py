@@ -60,6 +60,17 @@ def test_a_caller_follows_an_edit_of_the_kernel_it_calls(packages, tmp_path):
     assert run(packages, tmp_path / "cache") == 100
 
 
+def test_a_kernel_follows_an_edit_of_a_constant_elsewhere(packages, tmp_path):
+    callee = CALLEE.replace("{value}", "VALUE").replace(
+        "\n@", "from sl_inner.values import VALUE\n\n@"
+    )
+    (packages / "sl_inner" / "callee.py").write_text(callee)
+    (packages / "sl_inner" / "values.py").write_text("VALUE = 21\n")
+    assert run(packages, tmp_path / "cache") == 42
+    (packages / "sl_inner" / "values.py").write_text("VALUE = 50\n")
+    assert run(packages, tmp_path / "cache") == 100
+
+
 def test_a_package_keeps_its_kernels_when_only_its_users_change(packages, tmp_path):
     (packages / "sl_inner" / "callee.py").write_text(CALLEE.format(value=21))
     run(packages, tmp_path / "cache")

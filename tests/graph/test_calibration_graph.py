@@ -18,7 +18,6 @@ from support.paths import SOURCES
 
 ros_graph.require_ros()
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from sl_interfaces.action import Calibrate as CalibrateAction  # noqa: E402
 from sl_interfaces.srv import Calibrate, Verify  # noqa: E402
 
@@ -84,25 +83,13 @@ def start(directory: Path, domain: int) -> dict[str, subprocess.Popen[bytes]]:
     return processes
 
 
-def await_devices(graph: Graph) -> None:
-    """Wait until every node has said of itself that it is well."""
-    said: list[DiagnosticArray] = []
-    graph.tester.listen(topics.DIAGNOSTICS, said.append)
-
-    def ready() -> bool:
-        levels = {s.name.partition(":")[0]: s.level for array in said for s in array.status}
-        return all(levels.get(name) == DiagnosticStatus.OK for name in NODES)
-
-    wait(ready, "the devices", 280.0)
-
-
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     directory = tmp_path_factory.mktemp("graph")
     with ros_graph.graph() as graph:
         processes = start(directory, graph.domain)
         try:
-            await_devices(graph)
+            graph.await_well(NODES)
             yield Running(graph, directory, processes)
         finally:
             for process in processes.values():

@@ -86,6 +86,7 @@ def running(tmp_path: Path) -> Iterator[Running]:
     with ros_graph.graph() as graph:
         processes = start(tmp_path, graph.domain)
         try:
+            graph.await_well(NODES)
             yield Running(graph, processes)
         finally:
             for process in processes.values():

@@ -8,12 +8,13 @@ from __future__ import annotations
 import os
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import pytest
 
+from sl_common import topics
 from sl_common.topics import NAMESPACE, Service, Topic
 from support.domains import ReservedDomain
 from support.patience import PATIENCE_S, patience, wait
@@ -98,6 +99,16 @@ class Graph:
         client = self.tester.client(service)
         assert client.wait_for_service(patience(PATIENCE_S)), f"nobody offers {service.name}"
         return client.call_async(request)
+
+    def await_well(self, nodes: Iterable[str], seconds: float = 280.0) -> None:
+        """Wait until every node has said of itself that it is well."""
+        levels: dict[str, bytes] = {}
+
+        def hear(message: Any) -> None:
+            levels.update({s.name.partition(":")[0]: s.level for s in message.status})
+
+        self.tester.listen(topics.DIAGNOSTICS, hear)
+        wait(lambda: all(levels.get(n) == b"\0" for n in nodes), f"all well: {levels}", seconds)
 
     def close(self) -> None:
         """End everything, in the order of a clean shutdown: no callback runs any more."""

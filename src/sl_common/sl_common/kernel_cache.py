@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 UNUSED_AFTER_S = 30 * 24 * 3600
-_OURS = re.compile(rb"^\s*(?:from|import) (sl_\w+)", re.MULTILINE)
+_OURS = re.compile(rb"^(?:from|import) (sl_[\w.]+)", re.MULTILINE)
 
 _FunctionT = TypeVar("_FunctionT", bound=Callable[..., Any])
 
@@ -87,25 +87,35 @@ def _base() -> Path:
     return (Path(cache) if cache else Path.home() / ".cache") / "slrig" / "kernels"
 
 
-def _sources(package: str, known: dict[str, list[Path]]) -> dict[str, list[Path]]:
-    """Source files of a package and of ours that it imports, by package."""
+def _file(module: str) -> Path | None:
+    spec = importlib.util.find_spec(module)
+    return Path(spec.origin) if spec and spec.origin else None
+
+
+def _sources(package: str) -> set[Path]:
+    """Files that the package's kernels are made of: their own, and those of ours they import.
+
+    A constant of another module is compiled into a kernel, so it counts whether or not there are
+    kernels beside it.
+    """
     spec = importlib.util.find_spec(package)
     places = (spec.submodule_search_locations or ()) if spec else ()
-    known[package] = sorted(file for place in places for file in Path(place).rglob("*.py"))
-    for file in known[package]:
-        for name in {match.decode() for match in _OURS.findall(file.read_bytes())} - known.keys():
-            _sources(name, known)
-    return known
+    left = [f for p in places for f in Path(p).rglob("*.py") if b"@kernel(" in f.read_bytes()]
+    found: set[Path] = set()
+    while left:
+        file = left.pop()
+        if file not in found:
+            found.add(file)
+            names = {name.decode() for name in _OURS.findall(file.read_bytes())}
+            left += [origin for name in names if (origin := _file(name))]
+    return found
 
 
 def _digest(package: str) -> str:
-    """Digest of every source file with a kernel in it, and of where it lies."""
+    """Digest of the sources of a package's kernels, and of where they lie."""
     digest = hashlib.sha256()
-    for _, files in sorted(_sources(package, {}).items()):
-        for file in files:
-            text = file.read_bytes()
-            if b"@kernel(" in text or b"njit" in text:
-                digest.update(str(file).encode() + b"\0" + text)
+    for file in sorted(_sources(package)):
+        digest.update(str(file).encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()[:16]
 
 
