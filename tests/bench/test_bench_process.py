@@ -24,20 +24,19 @@ from sl_bench.world.world import World
 from sl_camera.camera.camera import CameraSettings
 from sl_camera.drivers.socket_camera import SocketCamera
 from sl_camera.stage.grbl.grbl_stage import GrblStage
-from sl_camera.sync.matching import (
+from sl_camera.sync.match_events import (
     FrameDecision,
     ImageEvent,
-    MatchedStack,
     MatcherSettings,
-    PoseEvent,
-    StackMatcher,
     Status,
     TriggerEvent,
 )
+from sl_camera.sync.matching import StackMatcher
 from sl_common.errors import CalibrationError, ConfigError, DeviceLost, DeviceRefused
 from sl_projector.dlpc.dlpc900_driver import Dlpc900
 from sl_projector.dlpc.dmd import Timing
 from sl_projector.sequence.pattern_sequence import named
+from sl_projector.sequence.stack import Stack, StagePose
 from sl_reconstruct.model.calibration_file import load_calibration, rig_hash
 from support.paths import ROOT
 from support.patience import Deadline, patience
@@ -105,9 +104,9 @@ class Devices:
         self.projector.close()
         self.control.close()
 
-    def pose(self) -> PoseEvent:
+    def pose(self) -> StagePose:
         x, y, z = self.stage.position_m()
-        return PoseEvent(time.time_ns(), (x, y, z), (0.0, 0.0, 0.0, 1.0))
+        return StagePose(time.time_ns(), (x, y, z), (0.0, 0.0, 0.0, 1.0))
 
     def scan(self) -> tuple[list[FrameDecision], list[int]]:
         """Project `paper` and match what comes; decisions, and the frame ids."""
@@ -152,7 +151,7 @@ def devices(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Devices]:
     end(process, signal.SIGTERM, directory)
 
 
-def complete(decisions: list[FrameDecision]) -> MatchedStack:
+def complete(decisions: list[FrameDecision]) -> Stack:
     last = next(d for d in reversed(decisions) if d.status >= Status.STACK_COMPLETE)
     assert last.stack is not None, last.reason
     return last.stack
@@ -168,12 +167,12 @@ def test_paper_stack_is_what_the_world_shows_for_each_pattern(devices: Devices) 
     """Seed and frame number make a frame repeatable, so the same world gives the same pixels."""
     decisions, frame_ids = devices.scan()
     stack = complete(decisions)
-    assert stack.data.shape == (11, 1200, 1600)
+    assert stack.images.shape == (11, 1200, 1600)
     world = World(reference_rig(), flat(), BenchSettings(seed=11).make_optics())
     for i in (0, 7, 10):
         expected = world.expose([(PAPER.frame(i), EXPOSURE_S)], EXPOSURE_S, frame_ids[i])
         # Not bit by bit: the exposure went through nanoseconds, which may tip a pixel over.
-        assert np.mean(stack.data[i] != expected) < 1e-4
+        assert np.mean(stack.images[i] != expected) < 1e-4
 
 
 def test_edges_on_the_images_lie_where_rays_and_part_meet(devices: Devices) -> None:
@@ -184,7 +183,7 @@ def test_edges_on_the_images_lie_where_rays_and_part_meet(devices: Devices) -> N
     boundaries = np.arange(20, 1004, 8)
     boundaries = boundaries[(boundaries % 16 == 4) | (boundaries % 16 == 12)]
     truth = world.truth_edges(boundaries.astype(np.float64), row)
-    line = stack.data[7, row].astype(np.float64)
+    line = stack.images[7, row].astype(np.float64)
     # Stripes are some 11 px wide: the local threshold is the mean of a running minimum and maximum.
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(line, 10, mode="edge"), 21)
     signed = line - (windows.min(axis=1) + windows.max(axis=1)) / 2
@@ -236,10 +235,10 @@ def test_lamp_and_parts_can_be_exchanged(devices: Devices) -> None:
     devices.control.lamp(0.0)
     dark = complete(devices.scan()[0])
     # Ambient light is 3 % of 190 DN.
-    assert dark.data.mean() < 10
+    assert dark.images.mean() < 10
     devices.control.lamp(1.0)
     devices.control.put("steps")
-    assert complete(devices.scan()[0]).data[0].mean() > 40
+    assert complete(devices.scan()[0]).images[0].mean() > 40
     devices.control.put("flat")
 
 

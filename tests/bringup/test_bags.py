@@ -18,16 +18,17 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from sl_bench.world.reference_rig import reference_rig
-from sl_bringup.bag.bag_writer import BagWriter, Storage, header, new_bag
+from sl_bringup.bag.bag_writer import BagWriter, Storage, new_bag
 from sl_bringup.bag.bags import (
     interface_dir,
-    message_class,
+    make_message,
     natural_key,
     open_bag,
     topic_names,
     typestore,
 )
 from sl_common.errors import BagError
+from sl_common.messages import header
 from sl_common.topics import CALIBRATION, IMAGE, POSE, TRIGGER
 from sl_projector.sequence.pattern_sequence import named
 from sl_reconstruct.model.calibration_file import Calibration, parse_calibration, rig_hash
@@ -211,9 +212,9 @@ def one_message_per_chunk(path: Path) -> list[int]:
     with writer:
         connection = writer.add_connection("/sl/camera/image_raw", IMAGE.msgtype, typestore=store)
         for i, image in enumerate(frames()):
-            message = message_class(IMAGE.msgtype)(
-                header=header(START_NS + i, "c"), height=48, width=64, encoding="mono8",
-                is_bigendian=0, step=64, data=image.reshape(-1),
+            message = make_message(
+                IMAGE.msgtype, header=header(START_NS + i, "c", make_message), height=48, width=64,
+                encoding="mono8", is_bigendian=0, step=64, data=image.reshape(-1),
             )  # fmt: skip
             writer.write(connection, START_NS + i, store.serialize_cdr(message, IMAGE.msgtype))
             storage: Any = writer.storage

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sl_bringup.bag.bag_writer import BagWriter, new_bag
-from sl_bringup.bag.bags import message_class
+from sl_bringup.bag.bags import make_message
 from sl_bringup.cli.main import main
 from sl_bringup.evaluation.sweep import variants
 from sl_common.errors import ConfigError
@@ -50,7 +50,7 @@ def record(
     with new_bag(path) as bag:
         bag.calibration(Calibration(rig or tiny_rig()), "true", START_NS)
         if settings:
-            message = message_class(SETTINGS.msgtype)(data=settings)
+            message = make_message(SETTINGS.msgtype, data=settings)
             bag.write(SETTINGS, START_NS, message)
         write_scans(bag, stacks)
     return path
@@ -65,7 +65,7 @@ def summary(folder: Path) -> dict:
 
 
 def live_report(scan_id: int, cloud_hash: str, settings_hash: str, calibration_hash: str) -> object:
-    return message_class(REPORT.msgtype)(
+    return make_message(REPORT.msgtype,
         scan_id=scan_id, sequence="precise", attempts=1, attempt_messages=[], rows=0, columns=0,
         points=0, lit_positions=0, refused=[], median_sigma_m=0.0, edge_sigma_px=0.0,
         edge_bound_px=0.0, edge_blur_px=0.0, acquisition_s=0.0, processing_s=0.0,

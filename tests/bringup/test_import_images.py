@@ -11,8 +11,8 @@ import pytest
 from sl_bringup.bag.bags import open_bag
 from sl_bringup.cli.import_images import import_folder, scan_folders
 from sl_bringup.cli.main import main
-from sl_camera.sync.message_fields import stamp_ns
 from sl_common.errors import BagError, StackError
+from sl_common.messages import stamp_from_msg
 from sl_common.topics import CALIBRATION, IMAGE, POSE, TRIGGER
 from sl_projector.sequence.pattern_sequence import named
 from sl_projector.sequence.sequence_file import SequenceFile, load_sequence_file
@@ -74,14 +74,14 @@ def test_images_come_in_natural_order_with_their_triggers(
         assert np.array_equal(image, frame)
     with open_bag(tmp_path / "a") as bag:
         triggers = [r.message for r in bag.messages(TRIGGER)]
-        stamps = [stamp_ns(r.message) for r in bag.messages(IMAGE)]
-        poses = [stamp_ns(r.message) for r in bag.messages(POSE)]
+        stamps = [stamp_from_msg(r.message.header.stamp) for r in bag.messages(IMAGE)]
+        poses = [stamp_from_msg(r.message.header.stamp) for r in bag.messages(POSE)]
     sequence = tiny_sequence("precise")
     for i, trigger in enumerate(triggers):
         assert (trigger.index, trigger.count, trigger.scan_id) == (i, len(sequence), 1)
         assert (trigger.dmd_columns, trigger.dmd_rows) == DMD_SIZE
         assert trigger.pattern.bit == sequence.patterns[i].bit
-        assert stamp_ns(trigger) == stamps[i]
+        assert stamp_from_msg(trigger.header.stamp) == stamps[i]
     assert poses[0] < stamps[0]
     assert poses[-1] > stamps[-1] + 20_000_000  # the stage is known to stand beyond the exposure
 

@@ -16,12 +16,13 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from sl_bringup.bag.bag_recorder import BagRecorder
-from sl_bringup.bag.bag_writer import header, topic_qos
-from sl_bringup.bag.bags import message_class, open_bag, typestore
+from sl_bringup.bag.bag_writer import topic_qos
+from sl_bringup.bag.bags import make_message, open_bag, typestore
 from sl_bringup.cli.main import main
 from sl_bringup.cli.record import size_bytes
 from sl_bringup.graph.console import StatusLine
 from sl_common.errors import BagError, ConfigError
+from sl_common.messages import header
 from sl_common.topics import CALIBRATION, IMAGE, POSE, SETTINGS, TRIGGER
 from sl_projector.sequence.pattern_sequence import named
 
@@ -37,15 +38,16 @@ def image(i: int) -> np.ndarray:
 
 
 def image_cdr(i: int) -> bytes:
-    message = message_class(IMAGE.msgtype)(
-        header=header(START_NS + i * STEP_NS, "c"), height=SHAPE[0], width=SHAPE[1],
-        encoding="mono8", is_bigendian=0, step=SHAPE[1], data=image(i).reshape(-1),
+    message = make_message(
+        IMAGE.msgtype, header=header(START_NS + i * STEP_NS, "c", make_message),
+        height=SHAPE[0], width=SHAPE[1], encoding="mono8", is_bigendian=0, step=SHAPE[1],
+        data=image(i).reshape(-1),
     )  # fmt: skip
     return bytes(typestore().serialize_cdr(message, IMAGE.msgtype))
 
 
 def settings_cdr(text: str) -> bytes:
-    message = message_class(SETTINGS.msgtype)(data=text)
+    message = make_message(SETTINGS.msgtype, data=text)
     return bytes(typestore().serialize_cdr(message, SETTINGS.msgtype))
 
 

@@ -11,8 +11,8 @@ import pytest
 from test_evaluate_many import START_NS, evaluate, live_report, summary, write_scans
 
 from sl_bringup.bag.bag_writer import BagWriter, new_bag
-from sl_bringup.bag.bags import message_class
-from sl_camera.sync.matching import MatcherSettings
+from sl_bringup.bag.bags import make_message
+from sl_camera.sync.match_events import MatcherSettings
 from sl_common.errors import ConfigError
 from sl_common.topics import CAMERA_SETTINGS, MATCHING, REPORT, SETTINGS, Topic
 from sl_reconstruct.decode import full_scale
@@ -27,7 +27,7 @@ def stacks() -> list[np.ndarray]:
 
 
 def latch(bag: BagWriter, topic: Topic, values: dict, stamp_ns: int = START_NS) -> None:
-    bag.write(topic, stamp_ns, message_class(topic.msgtype)(data=json.dumps(values)))
+    bag.write(topic, stamp_ns, make_message(topic.msgtype, data=json.dumps(values)))
 
 
 def record(

@@ -18,13 +18,7 @@ from sl_bringup.cli.calibrate import outcome_lines
 from sl_bringup.results.paper_tables import table_1_lines
 from sl_calibration.data.observations import load_observations
 from sl_calibration.data.run_store import CALIBRATION, OBSERVATIONS, Store
-from sl_calibration.data.session import (
-    CalibrationProgress,
-    CalibrationRequest,
-    Place,
-    Session,
-    Taken,
-)
+from sl_calibration.data.session import CalibrationProgress, CalibrationRequest, Place, Session
 from sl_calibration.data.view_extraction import observe, white_image
 from sl_calibration.solve.acceptance import Limits
 from sl_calibration.solve.ray_midpoints import triangulate
@@ -33,6 +27,7 @@ from sl_calibration.target.plate import DEFAULT_PLATE, Plate
 from sl_calibration.workflow.conclusion import solve_stored
 from sl_common.errors import CalibrationError, DeviceRefused, SequenceError
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence, named
+from sl_projector.sequence.stack import Stack
 from sl_reconstruct.model.calibration_file import load_calibration, rig_hash
 from support.calibration_bench import HEIGHTS_M, PLACES, START, Bench, FakeRig
 from support.calibration_scenes import RIG
@@ -172,9 +167,9 @@ def test_a_cancelled_run_stops_the_stage_and_leaves_the_old_calibration(bench: B
 def test_a_view_is_looked_at_while_the_next_is_taken() -> None:
     moved_on = threading.Event()
 
-    def look(taken: Taken, _: CalibrationRequest) -> Place:
-        assert taken.place != PLACES[0] or moved_on.wait(15.0)
-        return taken.place
+    def look(stack: Stack, _: CalibrationRequest) -> Place:
+        assert stack.place != PLACES[0] or moved_on.wait(15.0)
+        return stack.place
 
     def tell(progress: CalibrationProgress) -> None:
         if progress.view == 2:
@@ -185,7 +180,7 @@ def test_a_view_is_looked_at_while_the_next_is_taken() -> None:
 
 
 def test_a_device_that_fails_is_the_answer_and_the_stage_goes_back(bench: Bench) -> None:
-    def take(_: str) -> Taken:
+    def take(_: str) -> Stack:
         raise DeviceRefused("the projector is busy")
 
     bench.rig.take = take  # type: ignore[method-assign]
@@ -206,7 +201,7 @@ MARKED = Plate(9, 7, 1e-3, 0.4e-3, origin_diameter_m=0.6e-3)
 def seen(white: NDArray[np.uint8]) -> None:
     black = np.full_like(white, 6)
     request = CalibrationRequest("both", HEIGHTS_M, MARKED, "lit")
-    observe(Taken(np.stack([white, black]), LIT, 0.0), request)
+    observe(Stack(np.stack([white, black]), LIT), request)
 
 
 def test_a_dark_lamp_is_named() -> None:

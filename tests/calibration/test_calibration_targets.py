@@ -13,9 +13,8 @@ import pytest
 import sl_calibration.workflow.conclusion
 from sl_bench.world.mounting import Mounting
 from sl_bringup.bag.bag_writer import new_bag
-from sl_bringup.bag.bags import message_class
+from sl_bringup.bag.bags import make_message
 from sl_bringup.cli.main import main
-from sl_bringup.evaluation import calibrate_bag
 from sl_bringup.evaluation.calibrate_bag import solve_recorded
 from sl_calibration.bundle.parameters import lens_values
 from sl_calibration.data.run_store import CAMERA
@@ -25,6 +24,7 @@ from sl_calibration.solve.ray_midpoints import triangulate
 from sl_common.errors import CalibrationError
 from sl_common.topics import CALIBRATION_RUN
 from sl_projector.sequence.pattern_sequence import named
+from sl_projector.sequence.stack import Stack
 from sl_reconstruct.model.calibration_file import Calibration, Covariance
 from sl_reconstruct.model.rig import BrownConrady, Device, Rig
 from support.calibration_bench import HEIGHTS_M, PITCHES, SEQUENCE, START, Bench, look_with
@@ -38,7 +38,7 @@ GRID = np.stack(np.meshgrid(
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     # Recorded images are small, and nobody looks at them.
-    monkeypatch.setattr(calibrate_bag, "image_size", lambda _: RIG.camera.image_size)
+    monkeypatch.setattr(Stack, "image_size", property(lambda _: RIG.camera.image_size))
     # The pages are looked at elsewhere; drawing them takes longer than all the rest.
     for name in ("write_report", "write_camera_report"):
         monkeypatch.setattr(sl_calibration.workflow.conclusion, name, lambda *_: None)
@@ -200,7 +200,7 @@ def record(path: Path, run: dict[str, object] | None, places: list[tuple[float, 
             bag.pose(place, stamp_ns + 10**7)
             stamp_ns += 10**9
         if run is not None:
-            text = message_class(CALIBRATION_RUN.msgtype)(data=json.dumps(run))
+            text = make_message(CALIBRATION_RUN.msgtype, data=json.dumps(run))
             bag.write(CALIBRATION_RUN, stamp_ns, text)
 
 

@@ -12,12 +12,13 @@ import pytest
 
 import sl_calibration.workflow.calibrator
 from sl_calibration.data.run_store import Store
-from sl_calibration.data.session import CalibrationRequest, Taken
+from sl_calibration.data.session import CalibrationRequest
 from sl_calibration.solve.acceptance import Limits
 from sl_calibration.target.plate import Plate
 from sl_calibration.verify.rig_check import Check, VerifyLimits, check_on, default_heights
 from sl_calibration.workflow.calibrator import Calibrator, InForce, VerifyOutcome, VerifyRequest
 from sl_common.errors import CalibrationError
+from sl_projector.sequence.stack import Stack
 from sl_reconstruct.model.calibration_file import Calibration
 from sl_reconstruct.model.rig import Device, Rig
 from support.calibration_bench import PITCHES, START, FakeRig, look_with
@@ -38,13 +39,13 @@ class Checked:
         self.stretch = 1.0  # how far the plate really moves, over what the stage says
         monkeypatch.setattr(sl_calibration.workflow.calibrator, "check_rig_on", self.check)
 
-    def check(self, taken: Taken, target: str, plate: Plate, rig: Rig) -> Check:
-        self.rig.plate_m = taken.height_m * self.stretch
-        view = look_with(self.rig, 0.01, Scene(), seed=round(taken.height_m * 1e6) + 5000)(
-            taken, CalibrationRequest("both", (0.0,), plate, "precise-rows", least=1)
+    def check(self, stack: Stack, target: str, plate: Plate, rig: Rig) -> Check:
+        self.rig.plate_m = stack.place[2] * self.stretch
+        view = look_with(self.rig, 0.01, Scene(), seed=round(stack.place[2] * 1e6) + 5000)(
+            stack, CalibrationRequest("both", (0.0,), plate, "precise-rows", least=1)
         )
         holes = (view.centres_px, view.plate_xy_m) if target == "plate" else None
-        return check_on(rig, taken.height_m, (view.camera_px, view.dmd_px), holes)
+        return check_on(rig, stack.place[2], (view.camera_px, view.dmd_px), holes)
 
     def verify(
         self, heights_m: tuple[float, ...] = HEIGHTS_M, target: str = "plate"

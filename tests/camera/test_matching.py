@@ -9,18 +9,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from sl_camera.sync.matching import (
+from sl_camera.sync.match_events import (
     FrameDecision,
     ImageEvent,
-    MatchedStack,
     MatcherSettings,
-    PoseEvent,
-    StackMatcher,
     Status,
     TriggerEvent,
 )
+from sl_camera.sync.matching import StackMatcher
 from sl_common.errors import ConfigError
 from sl_projector.sequence.pattern_sequence import Pattern, named
+from sl_projector.sequence.stack import Stack, StagePose
 
 PAPER = named("paper")
 N = len(PAPER)
@@ -49,11 +48,11 @@ def identity(scan: int, index: int) -> int:
     return (scan % 600) * 100 + index
 
 
-def pose(stamp_ns: int, x_m: float = 0.0, **changes: object) -> PoseEvent:
-    return replace(PoseEvent(stamp_ns, (x_m, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), **changes)  # type: ignore[arg-type]
+def pose(stamp_ns: int, x_m: float = 0.0, **changes: object) -> StagePose:
+    return replace(StagePose(stamp_ns, (x_m, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), **changes)  # type: ignore[arg-type]
 
 
-Event = tuple[int, TriggerEvent | ImageEvent | PoseEvent]
+Event = tuple[int, TriggerEvent | ImageEvent | StagePose]
 
 
 @dataclass
@@ -110,14 +109,14 @@ def verdicts(decisions: list[FrameDecision]) -> list[FrameDecision]:
     return [d for d in decisions if d.status in (Status.STACK_COMPLETE, Status.STACK_REFUSED)]
 
 
-def stack_of(decision: FrameDecision) -> MatchedStack:
+def stack_of(decision: FrameDecision) -> Stack:
     assert decision.stack is not None, decision.reason
     return decision.stack
 
 
-def assert_right(stack: MatchedStack) -> None:
-    expected = [identity(stack.scan_id, i) for i in range(len(stack.data))]
-    assert (stack.data == np.array(expected)[:, None, None]).all()
+def assert_right(stack: Stack) -> None:
+    expected = [identity(stack.scan_id, i) for i in range(len(stack.images))]
+    assert (stack.images == np.array(expected)[:, None, None]).all()
 
 
 def refusal(*scripts: Script, settings: MatcherSettings | None = None) -> FrameDecision:
@@ -143,10 +142,10 @@ def test_good_scan_makes_one_stack_with_everything_in_it() -> None:
     assert [d.index for d in decisions[:-1]] == list(range(N))
     stack = stack_of(decisions[-1])
     assert_right(stack)
-    assert stack.data.shape == (N, *SHAPE)
+    assert stack.images.shape == (N, *SHAPE)
     assert stack.encoding == "mono16"
     assert stack.sequence == PAPER
-    assert stack.trigger_stamps_ns == tuple(T0 + i * PERIOD for i in range(N))
+    assert stack.stamps_ns == tuple(T0 + i * PERIOD for i in range(N))
     assert stack.pose is not None
     assert stack.exposure_s == 0.03
 
@@ -196,7 +195,7 @@ def test_one_pattern_and_eight_bit_images() -> None:
     script.images = [(T0 + 40 * MS, ImageEvent(T0, 2, 3, "mono8", bytes(range(6))))]
     stack = stack_of(verdicts(play(StackMatcher(), script))[0])
     assert stack.encoding == "mono8"
-    assert stack.data.tolist() == [[[0, 1, 2], [3, 4, 5]]]
+    assert stack.images.tolist() == [[[0, 1, 2], [3, 4, 5]]]
 
 
 def test_without_require_pose_no_pose_is_needed_and_moving_ones_still_refuse() -> None:
@@ -217,11 +216,11 @@ def test_memory_of_a_recycled_stack_is_used_again() -> None:
     matcher = StackMatcher()
     first = stack_of(verdicts(play(matcher, Script.good(1)))[0])
     second = stack_of(verdicts(play(matcher, Script.good(2, T0 + 2000 * MS)))[0])
-    assert not np.shares_memory(first.data, second.data)
+    assert not np.shares_memory(first.images, second.images)
     assert_right(first)
     matcher.recycle(first)
     third = stack_of(verdicts(play(matcher, Script.good(3, T0 + 4000 * MS)))[0])
-    assert np.shares_memory(first.data, third.data)
+    assert np.shares_memory(first.images, third.images)
     assert_right(third)
 
 

@@ -21,18 +21,18 @@ from sl_bench.world.world import World  # noqa: E402
 from sl_camera.camera.camera import CameraSettings  # noqa: E402
 from sl_camera.camera_node import CameraNode  # noqa: E402
 from sl_camera.drivers.aravis_camera import AravisCamera  # noqa: E402
-from sl_camera.sync.matching import (  # noqa: E402
+from sl_camera.sync.match_events import (  # noqa: E402
     FrameDecision,
     ImageEvent,
     MatcherSettings,
-    StackMatcher,
     Status,
     TriggerEvent,
 )
+from sl_camera.sync.matching import StackMatcher  # noqa: E402
 from sl_common import topics  # noqa: E402
+from sl_common.messages import stamp_from_msg, stamp_to_msg  # noqa: E402
 from sl_projector.dlpc.dlpc900_driver import Dlpc900  # noqa: E402
 from sl_projector.dlpc.dmd import Timing  # noqa: E402
-from sl_projector.sequence.messages import stamp_from_msg, stamp_to_msg  # noqa: E402
 from sl_projector.sequence.pattern_sequence import named  # noqa: E402
 from support.camera_bench import fake_gige, gige_bench, gvcp_port, require_gi  # noqa: E402
 from support.patience import wait  # noqa: E402

@@ -33,14 +33,14 @@ from sl_bench.dlpc.dlpc900_emulator import Dlpc900Emulator  # noqa: E402
 from sl_bench.dlpc.usb_server import EmulatedUsb, UsbSocketServer  # noqa: E402
 from sl_camera.camera.camera import Frame, FrameStatus  # noqa: E402
 from sl_camera.camera_node import CameraNode  # noqa: E402
-from sl_camera.messages import image_to_msg, pose_to_msg, stack_to_msg  # noqa: E402
 from sl_camera.stage_node import StageNode  # noqa: E402
-from sl_camera.sync.match_events import MatchedStack, PoseEvent  # noqa: E402
 from sl_camera.synchronizer_node import SynchronizerNode  # noqa: E402
 from sl_common import topics  # noqa: E402
 from sl_common.errors import ConfigError, DeviceError, DeviceLost, StackError  # noqa: E402
+from sl_common.messages import stamp_from_msg, stamp_to_msg  # noqa: E402
 from sl_projector.projector_node import ProjectorNode  # noqa: E402
-from sl_projector.sequence.messages import stamp_from_msg, stamp_to_msg, trigger_to_msg  # noqa: E402
+from sl_projector.sequence.messages import image_to_msg, pose_to_msg, stack_to_msg, trigger_to_msg  # noqa: E402
+from sl_projector.sequence.stack import Stack, StagePose  # noqa: E402
 from sl_reconstruct.cloud.cloud_writer import cloud_hash  # noqa: E402
 from sl_reconstruct.cloud.refusals import REFUSALS, Reason  # noqa: E402
 from sl_reconstruct.messages import cloud_from_msg, refusals_from_msg  # noqa: E402
@@ -103,14 +103,12 @@ class Feed:
         for message in poses([pose(start_ns - 1000), pose(stamps[-1] + PERIOD_NS)]):
             self.poses.publish(message)
         wanted = [
-            trigger_to_msg(SEQUENCE, i, self.scan_id, stamp, 0.019, "sl_projector_optical")
+            trigger_to_msg(SEQUENCE, i, self.scan_id, stamp, 0.019)
             for i, stamp in enumerate(stamps)
         ]
         for message in triggers(wanted):
             self.triggers.publish(message)
-        sent = [
-            image_to_msg(p, s, "sl_camera_optical") for p, s in zip(pixels, stamps, strict=True)
-        ]
+        sent = [image_to_msg(p, s) for p, s in zip(pixels, stamps, strict=True)]
         for image in images(sent):
             self.images.publish(image)
         return wait(self.verdict, "a verdict of the synchronizer"), pixels
@@ -121,7 +119,7 @@ class Feed:
 
 
 def pose(stamp_ns: int, x_m: float = 0.0) -> PoseStamped:
-    return pose_to_msg(PoseEvent(stamp_ns, (x_m, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+    return pose_to_msg(StagePose(stamp_ns, (x_m, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
 
 
 @pytest.fixture(scope="module")
@@ -200,9 +198,9 @@ def stack_message(name: str = "precise", scan_id: int = 1) -> PatternStack:
     sequence = tiny_sequence(name)
     start_ns = time.time_ns()
     stamps = tuple(start_ns + i * PERIOD_NS for i in range(len(sequence)))
-    still = PoseEvent(start_ns, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-    stack = MatchedStack(scan_id, sequence, frames(name), stamps, stamps, 0.019, still)
-    return stack_to_msg(stack, "sl_camera_optical")
+    still = StagePose(start_ns, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    stack = Stack(frames(name), sequence, scan_id, stamps, 0.019, still)
+    return stack_to_msg(stack)
 
 
 def assert_plane(message: PointCloud2) -> None:
@@ -612,9 +610,7 @@ def test_another_makers_driver_serves_by_remapping_its_image() -> None:
             start_ns = time.time_ns()
             for i in range(len(SEQUENCE)):
                 stamp_ns = start_ns + i * PERIOD_NS
-                triggers.publish(
-                    trigger_to_msg(SEQUENCE, i, scan_id, stamp_ns, 0.019, "sl_projector_optical")
-                )
+                triggers.publish(trigger_to_msg(SEQUENCE, i, scan_id, stamp_ns, 0.019))
             for i in images:
                 padded = np.zeros((6, 10), np.uint8)
                 padded[:, :7] = pixels[i]

@@ -22,7 +22,7 @@ from test_slrig_graph import READY_PATIENCE_S, Command  # noqa: E402
 
 from sl_bringup.bag.bags import open_bag  # noqa: E402
 from sl_bringup.cli.main import main  # noqa: E402
-from sl_camera.sync.matching import MatcherSettings  # noqa: E402
+from sl_camera.sync.match_events import MatcherSettings  # noqa: E402
 from sl_camera.synchronizer_node import SynchronizerNode  # noqa: E402
 from sl_common import topics  # noqa: E402
 from sl_common.topics import (  # noqa: E402

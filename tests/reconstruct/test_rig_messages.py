@@ -12,8 +12,9 @@ from support import ros_graph
 ros_graph.require_ros()
 
 from sl_bench.world.reference_rig import reference_rig  # noqa: E402
-from sl_projector.sequence.messages import stamp_from_msg, stamp_to_msg  # noqa: E402
-from sl_reconstruct.messages import camera_info, frames_of, pose, quaternion_xyzw  # noqa: E402
+from sl_common.messages import stamp_from_msg, stamp_to_msg  # noqa: E402
+from sl_projector.sequence.messages import rigid_to_msg  # noqa: E402
+from sl_reconstruct.messages import camera_info, frames_of, quaternion_xyzw  # noqa: E402
 from sl_reconstruct.model.opencv_lens import plumb_bob  # noqa: E402
 from sl_reconstruct.model.rig import BrownConrady, Device  # noqa: E402
 
@@ -64,7 +65,7 @@ def test_quaternions_are_scipys_for_every_kind_of_rotation() -> None:
 
 def test_a_pose_maps_world_points_and_a_frame_is_its_inverse() -> None:
     rig = reference_rig()
-    message = pose(rig.camera.rotation, rig.camera.translation_m)
+    message = rigid_to_msg(rig.camera.translation_m, quaternion_xyzw(rig.camera.rotation))
     q = message.orientation
     turn = Rotation.from_quat([q.x, q.y, q.z, q.w])
     shift = np.array([message.position.x, message.position.y, message.position.z])

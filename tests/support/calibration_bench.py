@@ -11,13 +11,7 @@ import numpy as np
 
 from sl_calibration.data.observations import View
 from sl_calibration.data.run_store import Store
-from sl_calibration.data.session import (
-    CalibrationProgress,
-    CalibrationRequest,
-    Place,
-    RunCancelled,
-    Taken,
-)
+from sl_calibration.data.session import CalibrationProgress, CalibrationRequest, Place, RunCancelled
 from sl_calibration.solve.acceptance import Limits
 from sl_calibration.target.plate import Plate
 from sl_calibration.workflow.calibrator import Calibrator, InForce
@@ -25,6 +19,7 @@ from sl_calibration.workflow.conclusion import Outcome
 from sl_calibration.workflow.run_record import Pitches
 from sl_common.errors import CalibrationError
 from sl_projector.sequence.pattern_sequence import named
+from sl_projector.sequence.stack import Stack, StagePose
 from support.calibration_scenes import CAMERA, RIG, Scene
 
 HEIGHTS_M = (-1e-3, -0.5e-3, 0.0, 0.5e-3, 1e-3)
@@ -64,12 +59,12 @@ class FakeRig:
             self.place = place
         return self.place
 
-    def take(self, sequence: str) -> Taken:
+    def take(self, sequence: str) -> Stack:
         assert sequence == "precise-rows"
         width, height = CAMERA.image_size
         images = np.broadcast_to(np.uint8(0), (len(SEQUENCE), height, width))
         self.taken += 1
-        return Taken(images, SEQUENCE, self.place[2], self.place[:2], self.taken)
+        return Stack(images, SEQUENCE, self.taken, pose=StagePose(0, self.place))
 
     def halt(self) -> None:
         self.halted = True
@@ -77,21 +72,21 @@ class FakeRig:
 
 def look_with(
     rig: FakeRig, noise_px: float = 0.01, scene: Scene | None = None, seed: int = 7
-) -> Callable[[Taken, CalibrationRequest], View]:
+) -> Callable[[Stack, CalibrationRequest], View]:
     """What is seen of the plate: computed, not rendered."""
     scene = replace(scene or Scene(), hole_noise_px=noise_px)
     rng = np.random.default_rng(seed)
 
-    def look(taken: Taken, request: CalibrationRequest) -> View:
-        height_m = taken.height_m if rig.plate_m is None else rig.plate_m
-        stage_m = np.array([*taken.xy_m, height_m])
+    def look(stack: Stack, request: CalibrationRequest) -> View:
+        height_m = stack.place[2] if rig.plate_m is None else rig.plate_m
+        stage_m = np.array([*stack.place[:2], height_m])
         holes, thrown = scene.holes(rng, stage_m), scene.thrown(rng, stage_m)
         ids = np.stack(np.meshgrid(range(10), range(10)), axis=-1).reshape(-1, 2)
         few = slice(None) if request.patterns else slice(0)
         return View(
-            taken.height_m, ids, holes.plate_xy_m, holes.pixels, holes.sigma_px[:, 0],
+            stack.place[2], ids, holes.plate_xy_m, holes.pixels, holes.sigma_px[:, 0],
             thrown.camera_px[few], thrown.projector_px[few], thrown.sigma_px[few], 0.02,
-            taken.xy_m,
+            stack.place[:2],
         )  # fmt: skip
 
     return look

@@ -16,8 +16,8 @@ from sl_bringup.bag.bags import Bag, Raw, open_bag
 from sl_bringup.graph.console import StatusLine, complain, say
 from sl_common.base_node import GraphNode
 from sl_common.errors import BagError, SlError
+from sl_common.messages import stamp_to_msg
 from sl_common.topics import CLOCK, RAW_TOPICS, RECORDED_TOPICS, Topic
-from sl_projector.sequence.messages import stamp_to_msg
 
 CLOCK_S, SHOW_S = 0.01, 1.0
 #: Listeners of one process are discovered one after the other.

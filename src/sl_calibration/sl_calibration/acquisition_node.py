@@ -16,12 +16,13 @@ from sl_interfaces.msg import MatchedFrame
 from sl_interfaces.srv import MoveStage
 from std_srvs.srv import Trigger
 
-from sl_calibration.data.session import Place, RunCancelled, Taken, in_words
+from sl_calibration.data.session import Place, RunCancelled, in_words
 from sl_common import topics
 from sl_common.base_node import RigNode, next_scan_id
 from sl_common.errors import CalibrationError, DeviceError, DeviceTimeout, SlError
-from sl_projector.sequence.messages import stamp_from_msg
-from sl_reconstruct.messages import stack_from_msg
+from sl_common.messages import stamp_from_msg
+from sl_projector.sequence.messages import stack_from_msg
+from sl_projector.sequence.stack import Stack
 from sl_reconstruct.projector_client_node import ProjectorClient
 from sl_reconstruct.scan.scan_flow import ScanRequest, ScanRun, ScanTimeouts, ScanWatch
 
@@ -170,7 +171,7 @@ class GraphDevices:
 
     # -- images ---------------------------------------------------------------------------------
 
-    def take(self, sequence: str) -> Taken:
+    def take(self, sequence: str) -> Stack:
         """Project a sequence; spoilt attempts are repeated."""
         order = ScanRequest(sequence, 0.0, self.max_repeats, REST_S)
         result = ScanRun(self, order, lambda _: None, self._cancelled, self.timeouts).run()
@@ -179,8 +180,8 @@ class GraphDevices:
             raise RunCancelled("calibration cancelled")
         if not result.success:
             raise CalibrationError(f"no images: {result.message}")
-        taken: Taken = result.report
-        return taken
+        stack: Stack = result.report
+        return stack
 
     def _on_frame(self, message: Any) -> None:
         watch = self._watch
@@ -199,7 +200,8 @@ class GraphDevices:
             return
         watch.arrived()
         try:
-            watch.finished(_taken(message))
+            stack = stack_from_msg(message)
+            watch.finished(_with_place(stack))
         except SlError as error:
             watch.finished(error)
 
@@ -234,16 +236,10 @@ class GraphDevices:
         self._projector.stop()
 
 
-def _taken(message: Any) -> Taken:
-    """Images and pose of a stack; a stack without a pose is of no use here."""
-    stack = stack_from_msg(message)
-    if not message.stage_pose.header.frame_id:
-        raise CalibrationError(
-            f"the stack of scan {message.scan_id} has no stage pose; expected one: set the "
-            "synchronizer's parameter require_pose"
-        )
-    x, y, z = _position(message.stage_pose)
-    return Taken(stack.take_images(), stack.sequence, z, (x, y), int(message.scan_id))
+def _with_place(stack: Stack) -> Stack:
+    """Refuse a stack without a pose: it is of no use here."""
+    assert stack.place is not None
+    return stack
 
 
 def _position(stamped: Any) -> Place:

@@ -32,7 +32,7 @@ from sl_calibration.workflow.warm_up import warm_up_apart
 from sl_common import topics
 from sl_common.base_node import Health, RigNode, run
 from sl_common.errors import CalibrationError, SlError
-from sl_projector.sequence.messages import stamp_from_msg
+from sl_common.messages import stamp_from_msg
 from sl_reconstruct.messages import rig_to_msg
 from sl_reconstruct.model.calibration_file import Calibration, load_calibration, parse_calibration
 from sl_reconstruct.scan.scan_flow import ScanTimeouts

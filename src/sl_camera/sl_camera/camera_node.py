@@ -28,12 +28,13 @@ from sl_camera.camera.software_trigger import PatternWindows
 from sl_camera.drivers.aravis_camera import AravisOptions
 from sl_camera.drivers.camera_drivers import ADDRESSES, make_camera
 from sl_camera.drivers.uvc_camera import UvcOptions
-from sl_camera.messages import camera_info_for, image_to_msg
+from sl_camera.messages import camera_info_for
 from sl_common import topics
 from sl_common.base_node import Health, RigNode, device_health, run
 from sl_common.device_link import DeviceLink
 from sl_common.errors import DeviceError, DeviceRefused, SlError
-from sl_projector.sequence.messages import stamp_from_msg
+from sl_common.messages import stamp_from_msg
+from sl_projector.sequence.messages import image_to_msg
 
 READ_TIMEOUT_S = 0.1
 SETTING_TIMEOUT_S = 3.0
@@ -196,7 +197,7 @@ class CameraNode(RigNode):
                 self.complain(topics.IMAGE.name, error)
                 return
         self._tell(self._settings, frame.full_scale_dn)
-        image = image_to_msg(frame.image, frame.stamp_ns, topics.CAMERA_FRAME)
+        image = image_to_msg(frame.image, frame.stamp_ns)
         self._images.publish(image)
         self._infos.publish(camera_info_for(self._calibrated, image))
 

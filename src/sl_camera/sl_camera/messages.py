@@ -1,93 +1,82 @@
-"""Images, poses, verdicts and stacks as ROS messages; `message_fields` has the way back.
+"""Events for the matcher from messages, its decisions as messages, and the camera's info.
 
-Pixels are not copied where that can be avoided: rclpy's setter of ``uint8[]`` fields copies into
-an ``array.array`` (0.15 s for an image given as ndarray), but its serialisation takes anything
-with a buffer, so the field's storage is set directly.
+Functions that read take messages of rclpy (live) and of rosbags (an evaluation) alike.
 """
 
 from __future__ import annotations
 
-import math
+from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
-from sensor_msgs.msg import CameraInfo, Image
-from sl_interfaces.msg import MatchedFrame, PatternStack
 
-from sl_camera.stage.stage import Position
-from sl_camera.sync.match_events import PIXEL_TYPES, FrameDecision, MatchedStack, PoseEvent
-from sl_projector.sequence.messages import pattern_to_msg, stamp_to_msg
-
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
-
-_ENCODINGS = {dtype.itemsize: name for name, dtype in PIXEL_TYPES.items()}
+from sl_camera.sync.match_events import FrameDecision, ImageEvent, TriggerEvent
+from sl_common.messages import header, ros_message, stamp_from_msg, stamp_to_msg
+from sl_common.topics import CAMERA_FRAME, CAMERA_INFO, FRAME
+from sl_projector.sequence.messages import pattern_from_msg, pose_to_msg
+from sl_projector.sequence.stack import PIXEL_TYPES
 
 
-def image_to_msg(pixels: Pixels, stamp_ns: int, frame_id: str) -> Image:
-    """One image as a message that shares the pixels' memory until it is published.
+def trigger_event(message: Any) -> TriggerEvent:
+    """One trigger for the matcher.
+
+    Raises
+    ------
+    SequenceError
+        When its pattern is none.
+    """
+    return TriggerEvent(
+        scan_id=message.scan_id,
+        sequence_name=message.sequence,
+        dmd_size=(message.dmd_columns, message.dmd_rows),
+        index=message.index,
+        count=message.count,
+        pattern=pattern_from_msg(message.pattern),
+        stamp_ns=stamp_from_msg(message.header.stamp),
+        exposure_s=message.exposure_s,
+    )
+
+
+def image_event(message: Any) -> ImageEvent:
+    """One image for the matcher, which also judges it; its rows have no padding any more.
+
+    Big-endian pixels are turned round. A message whose numbers do not fit each other is passed on
+    as it is: the matcher says what is wrong with it.
+    """
+    data: NDArray[Any] = np.frombuffer(message.data, np.uint8)
+    size = PIXEL_TYPES[message.encoding].itemsize if message.encoding in PIXEL_TYPES else 1
+    row_bytes = message.width * size
+    if message.step > row_bytes and data.size == message.step * message.height:
+        data = np.ascontiguousarray(data.reshape(message.height, message.step)[:, :row_bytes])
+    if size == 2 and message.is_bigendian and data.size % 2 == 0:
+        data = data.reshape(-1).view(">u2").astype("<u2")
+    stamp_ns, flat = stamp_from_msg(message.header.stamp), data.reshape(-1).view(np.uint8)
+    return ImageEvent(stamp_ns, message.height, message.width, message.encoding, flat)
+
+
+def camera_info_for(template: Any, image: Any) -> Any:
+    """Return the camera info that goes with an image: same stamp, frame and size.
 
     Parameters
     ----------
-    pixels : ndarray, (H, W), uint8 or uint16
-        The image, C order.
-    stamp_ns : int
-        Start of the exposure.
-    frame_id : str
-        Frame of the camera.
+    template : sensor_msgs/CameraInfo or None
+        Of the calibration. Without one, or with one for another image size, K is zero, which
+        means "uncalibrated".
+    image : sensor_msgs/Image
+        The image.
     """
-    height, width = pixels.shape
-    message = Image(
-        height=height,
-        width=width,
-        encoding=_ENCODINGS[pixels.itemsize],
-        step=width * pixels.itemsize,
-    )
-    message.header.stamp = stamp_to_msg(stamp_ns)
-    message.header.frame_id = frame_id
-    message._data = _bytes_of(pixels)
-    return message
-
-
-def _bytes_of(pixels: Pixels) -> NDArray[np.uint8]:
-    """Flat byte view; copies only what is not in C order."""
-    return np.ascontiguousarray(pixels).reshape(-1).view(np.uint8)
-
-
-def camera_info_for(template: CameraInfo | None, image: Image) -> CameraInfo:
-    """Return the camera info that goes with an image: same stamp, frame and size.
-
-    Without a calibration, or with one for another image size, K is zero: "uncalibrated".
-    """
-    info = CameraInfo(height=image.height, width=image.width)
-    if template is not None and (template.height, template.width) == (image.height, image.width):
-        info = template
+    info = template
+    if info is None or (info.height, info.width) != (image.height, image.width):
+        info = ros_message(CAMERA_INFO.msgtype, height=image.height, width=image.width)
     info.header = image.header
     return info
 
 
-def pose_to_msg(pose: PoseEvent | None) -> PoseStamped:
-    """One pose as a message; an unknown one has NaN for its position."""
-    message = PoseStamped()
-    if pose is None:
-        message.pose.position.x = message.pose.position.y = message.pose.position.z = math.nan
-        return message
-    message.header.stamp = stamp_to_msg(pose.stamp_ns)
-    message.header.frame_id = pose.frame_id
-    p, q = message.pose.position, message.pose.orientation
-    p.x, p.y, p.z = pose.position_m
-    q.x, q.y, q.z, q.w = pose.quaternion_xyzw
-    return message
-
-
-def stage_pose(position_m: Position, stamp_ns: int, frame_id: str) -> PoseStamped:
-    """Where a stage without rotary axes stands."""
-    return pose_to_msg(PoseEvent(stamp_ns, position_m, (0.0, 0.0, 0.0, 1.0), frame_id))
-
-
-def decision_to_msg(decision: FrameDecision, frame_id: str) -> MatchedFrame:
-    """One verdict of the matcher as a message."""
-    message = MatchedFrame(
+def decision_to_msg(decision: FrameDecision) -> Any:
+    """One decision of the matcher as a ``sl_interfaces/MatchedFrame``."""
+    return ros_message(
+        FRAME.msgtype,
+        header=header(decision.stamp_ns, CAMERA_FRAME),
         scan_id=decision.scan_id,
         index=decision.index,
         count=decision.count,
@@ -98,28 +87,3 @@ def decision_to_msg(decision: FrameDecision, frame_id: str) -> MatchedFrame:
         time_error_s=decision.time_error_s,
         stage_pose=pose_to_msg(decision.pose),
     )
-    message.header.stamp = stamp_to_msg(decision.stamp_ns)
-    message.header.frame_id = frame_id
-    return message
-
-
-def stack_to_msg(stack: MatchedStack, frame_id: str) -> PatternStack:
-    """One complete stack as a message that shares the images' memory until it is published."""
-    _, height, width = stack.data.shape
-    message = PatternStack(
-        scan_id=stack.scan_id,
-        sequence=stack.sequence.name,
-        dmd_columns=stack.sequence.dmd_size[0],
-        dmd_rows=stack.sequence.dmd_size[1],
-        patterns=[pattern_to_msg(p) for p in stack.sequence.patterns],
-        stamps=[stamp_to_msg(stamp_ns) for stamp_ns in stack.image_stamps_ns],
-        exposure_s=stack.exposure_s,
-        height=height,
-        width=width,
-        encoding=stack.encoding,
-        stage_pose=pose_to_msg(stack.pose),
-    )
-    message.header.stamp = message.stamps[0]
-    message.header.frame_id = frame_id
-    message._data = _bytes_of(stack.data)
-    return message

@@ -10,7 +10,6 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 
-from sl_camera.messages import stage_pose
 from sl_camera.stage.grbl.grbl_stage import GrblStage
 from sl_camera.stage.manual_stage import ManualStage
 from sl_camera.stage.stage import Position, StageDriver, StageState
@@ -26,6 +25,8 @@ from sl_common.errors import (
     DeviceTimeout,
     SlError,
 )
+from sl_projector.sequence.messages import pose_to_msg
+from sl_projector.sequence.stack import StagePose
 
 KINDS = ("grbl", "zaber", "manual")
 
@@ -186,7 +187,7 @@ class StageNode(RigNode):
             self._moves -= 1
 
     def _pose(self, position_m: Position, stamp_ns: int) -> PoseStamped:
-        return stage_pose(position_m, stamp_ns, topics.WORLD_FRAME)
+        return pose_to_msg(StagePose(stamp_ns, position_m))
 
     def _check_lost(self, driver: StageDriver, error: DeviceError) -> None:
         self.note(str(error))

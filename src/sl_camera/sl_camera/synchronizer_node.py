@@ -9,12 +9,13 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import Image
 from sl_interfaces.msg import PatternTrigger
 
-from sl_camera.messages import decision_to_msg, stack_to_msg
-from sl_camera.sync.match_events import FrameDecision, MatchedStack, MatcherSettings, Status
+from sl_camera.messages import decision_to_msg, image_event, trigger_event
+from sl_camera.sync.match_events import FrameDecision, MatcherSettings, Status
 from sl_camera.sync.matching import StackMatcher
-from sl_camera.sync.message_fields import image_event, pose_event, trigger_event
 from sl_common import topics
 from sl_common.base_node import Health, RigNode, run
+from sl_projector.sequence.messages import pose_from_msg, stack_to_msg
+from sl_projector.sequence.stack import Stack
 
 #: While a scan is open, time-outs and the settling time are looked at so often.
 TICK_S = 0.004
@@ -72,7 +73,7 @@ class SynchronizerNode(RigNode):
         self._publish(self._matcher.image(event, time.monotonic_ns()))
 
     def _on_pose(self, message: PoseStamped) -> None:
-        event = pose_event(message)
+        event = pose_from_msg(message)
         if fault := event.fault():
             self.complain(topics.POSE.name, ValueError(fault))
         self._publish(self._matcher.pose(event, time.monotonic_ns()))
@@ -85,7 +86,7 @@ class SynchronizerNode(RigNode):
             self.counts[decision.status.name.lower()] += 1
             if decision.stack is not None:
                 self._publish_stack(decision.stack)
-            self._frames.publish(decision_to_msg(decision, topics.CAMERA_FRAME))
+            self._frames.publish(decision_to_msg(decision))
             if decision.status not in (Status.MATCHED, Status.STACK_COMPLETE):
                 self.get_logger().warning(f"scan {decision.scan_id}: {decision.reason}")
             if decision.status in (Status.STACK_COMPLETE, Status.STACK_REFUSED):
@@ -95,9 +96,9 @@ class SynchronizerNode(RigNode):
         if self._matcher.busy == self._ticks.is_canceled():
             self._ticks.reset() if self._matcher.busy else self._ticks.cancel()
 
-    def _publish_stack(self, stack: MatchedStack) -> None:
+    def _publish_stack(self, stack: Stack) -> None:
         """Publish before the verdict, so that whoever hears the verdict can expect the stack."""
-        self._stacks.publish(stack_to_msg(stack, topics.CAMERA_FRAME))
+        self._stacks.publish(stack_to_msg(stack))
         self._matcher.recycle(stack)
 
 

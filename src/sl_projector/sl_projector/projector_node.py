@@ -21,6 +21,7 @@ from sl_common.errors import (
     SequenceError,
     SlError,
 )
+from sl_common.messages import stamp_from_msg
 from sl_projector.dlpc.dlpc350_driver import Dlpc350, Dlpc350Settings
 from sl_projector.dlpc.dlpc900_driver import Dlpc900, Dlpc900Settings
 from sl_projector.dlpc.dmd import (
@@ -33,7 +34,7 @@ from sl_projector.dlpc.dmd import (
     TriggerOut,
     dmd_model,
 )
-from sl_projector.sequence.messages import stamp_from_msg, trigger_to_msg
+from sl_projector.sequence.messages import trigger_to_msg
 from sl_projector.sequence.pattern_sequence import NAMED, PatternSequence, named
 from sl_projector.sequence.sequence_file import load_sequence
 
@@ -285,14 +286,7 @@ class ProjectorNode(RigNode):
             if self._halted.wait(max(0.0, (start_ns - time.time_ns()) * 1e-9)):
                 raise DeviceRefused("the projection was stopped")
             self._triggers.publish(
-                trigger_to_msg(
-                    sequence,
-                    index,
-                    scan_id,
-                    start_ns,
-                    info.timing.exposure_s,
-                    topics.PROJECTOR_FRAME,
-                )
+                trigger_to_msg(sequence, index, scan_id, start_ns, info.timing.exposure_s)
             )
         return len(sequence)
 

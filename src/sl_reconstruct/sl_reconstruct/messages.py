@@ -1,113 +1,42 @@
-"""Stacks, clouds and rigs as ROS messages and back; what comes in is checked.
+"""Clouds, reports and rigs as ROS messages and back; what comes in is checked.
 
-Pixels and points are not copied here: a stack is a view into its message, and a cloud's message
-shares the cloud's memory until it is published (rclpy serialises anything with a buffer).
+Points are not copied: a cloud's message shares the cloud's memory until it is published. The rig is
+written for rclpy and for rosbags alike (``make``, see `sl_common.messages`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Pose, Quaternion, TransformStamped, Vector3
 from numpy.typing import NDArray
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
-from sl_interfaces.msg import PatternStack, RefusalCount, RigCalibration, ScanReport
+from scipy.spatial.transform import Rotation
 
-from sl_common.errors import SequenceError, StackError
-from sl_common.topics import CAMERA_FRAME, PROJECTOR_FRAME, WORLD_FRAME
-from sl_projector.sequence.messages import sequence_from_msgs, stamp_from_msg, stamp_to_msg
-from sl_projector.sequence.pattern_sequence import PatternSequence
+from sl_common.errors import StackError
+from sl_common.messages import MakeMessage, header, ros_message
+from sl_common.topics import (
+    CALIBRATION,
+    CAMERA_FRAME,
+    CAMERA_INFO,
+    POINTS,
+    PROJECTOR_FRAME,
+    REPORT,
+    WORLD_FRAME,
+)
+from sl_projector.sequence.messages import flat_bytes, rigid_to_msg
+from sl_projector.sequence.stack import Stack
 from sl_reconstruct.cloud.cloud_writer import cloud_hash
 from sl_reconstruct.model.calibration_file import Calibration, dump_calibration
 from sl_reconstruct.model.opencv_lens import plumb_bob
 from sl_reconstruct.model.rig import Device, Rig
 from sl_reconstruct.reconstruction.reconstructor_cache import Product
 
-Array = NDArray[np.float64]
-
-_PIXELS: dict[str, np.dtype[Any]] = {"mono8": np.dtype(np.uint8), "mono16": np.dtype("<u2")}
-
-
-@dataclass
-class Stack:
-    """All images of one scan.
-
-    Parameters
-    ----------
-    scan_id : int
-        The scan.
-    sequence : PatternSequence
-        One pattern per image.
-    images : ndarray, (N, H, W), uint8 or uint16, or None
-        View into the message; None once they were taken.
-    stamps_ns : tuple of int
-        Start of each exposure.
-    exposure_s : float
-        Exposure of each pattern, seconds.
-    """
-
-    scan_id: int
-    sequence: PatternSequence
-    images: NDArray[Any] | None
-    stamps_ns: tuple[int, ...]
-    exposure_s: float
-
-    def take_images(self) -> NDArray[Any]:
-        """Hand the images over: their memory is free as soon as the taker drops them."""
-        images, self.images = self.images, None
-        if images is None:
-            raise StackError(f"the images of scan {self.scan_id} were taken already")
-        return images
+#: sensor_msgs/PointField's numbers for types.
+_FLOAT32, _FLOAT64 = 7, 8
 
 
-def stack_from_msg(message: PatternStack) -> Stack:
-    """Check a stack message and return what is in it, without a copy of its pixels.
-
-    Raises
-    ------
-    StackError
-        When encoding, size, number of images, stamps or patterns do not fit each other.
-    """
-    try:
-        size = (message.dmd_columns, message.dmd_rows)
-        sequence = sequence_from_msgs(message.sequence, size, message.patterns)
-    except SequenceError as error:
-        raise StackError(f"stack of scan {message.scan_id}: {error}") from error
-    stamps_ns = tuple(stamp_from_msg(stamp) for stamp in message.stamps)
-    if len(stamps_ns) != len(sequence):
-        raise StackError(
-            f"stack of scan {message.scan_id} has {len(stamps_ns)} stamps for {len(sequence)} "
-            "patterns; expected one each"
-        )
-    if any(b <= a for a, b in pairwise(stamps_ns)):
-        raise StackError(f"stack of scan {message.scan_id}: its stamps do not increase")
-    return Stack(
-        message.scan_id, sequence, _images(message, len(sequence)), stamps_ns, message.exposure_s
-    )
-
-
-def _images(message: PatternStack, count: int) -> NDArray[Any]:
-    if message.encoding not in _PIXELS:
-        raise StackError(
-            f"stack of scan {message.scan_id} has the encoding {message.encoding!r}; expected one "
-            f"of {sorted(_PIXELS)}"
-        )
-    dtype = _PIXELS[message.encoding]
-    expected = count * message.height * message.width * dtype.itemsize
-    if expected == 0 or len(message.data) != expected:
-        raise StackError(
-            f"stack of scan {message.scan_id} has {len(message.data)} bytes; expected {count} "
-            f"images of {message.width} x {message.height} {message.encoding} = {expected} (not 0)"
-        )
-    flat: NDArray[Any] = np.frombuffer(message.data, dtype)
-    return flat.reshape(count, message.height, message.width)
-
-
-def cloud_to_msg(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointCloud2:
-    """One organised cloud as a message that shares its memory until it is published.
+def cloud_to_msg(points: NDArray[Any], stamp_ns: int) -> Any:
+    """One organised cloud in the world as a ``sensor_msgs/PointCloud2``.
 
     Parameters
     ----------
@@ -115,51 +44,28 @@ def cloud_to_msg(points: NDArray[Any], stamp_ns: int, frame_id: str) -> PointClo
         Fields x, y, z, sigma in metres and intensity; NaN where there is no point.
     stamp_ns : int
         Start of the scan's first exposure.
-    frame_id : str
-        Frame of x, y, z.
     """
     layout: dict[str, Any] = dict(points.dtype.fields or {})
     rows, columns = points.shape
-    message = PointCloud2(
+    return ros_message(
+        POINTS.msgtype,
+        header=header(stamp_ns, WORLD_FRAME),
         height=rows,
         width=columns,
         fields=[
-            PointField(name=name, offset=place[1], datatype=PointField.FLOAT32, count=1)
+            ros_message(
+                "sensor_msgs/msg/PointField", name=name, offset=place[1], datatype=_FLOAT32, count=1
+            )
             for name, place in layout.items()
         ],
-        is_bigendian=False,
         point_step=points.itemsize,
         row_step=points.itemsize * columns,
-        is_dense=False,
+        data=flat_bytes(points),
     )
-    message.header.stamp = stamp_to_msg(stamp_ns)
-    message.header.frame_id = frame_id
-    message._data = np.ascontiguousarray(points).reshape(-1).view(np.uint8)
-    return message
 
 
-def refusals_to_msg(reason: NDArray[np.uint8], stamp_ns: int, frame_id: str) -> Image:
-    """Why each position of an organised cloud holds no point, as an image of `Reason` codes.
-
-    Parameters
-    ----------
-    reason : ndarray, (rows, columns), uint8
-        A code for each position of the cloud.
-    stamp_ns : int
-        The cloud's stamp.
-    frame_id : str
-        Frame of the camera, whose rows these are; columns are the cloud's.
-    """
-    rows, columns = reason.shape
-    message = Image(height=rows, width=columns, encoding="mono8", step=columns)
-    message.header.stamp = stamp_to_msg(stamp_ns)
-    message.header.frame_id = frame_id
-    message._data = np.ascontiguousarray(reason).reshape(-1)
-    return message
-
-
-def refusals_from_msg(message: Image) -> NDArray[np.uint8]:
-    """Codes of `Reason`, (rows, columns); a view into the message.
+def refusals_from_msg(message: Any) -> NDArray[np.uint8]:
+    """Why each position of a cloud holds no point: codes of `Reason`, a view into the message.
 
     Raises
     ------
@@ -175,11 +81,12 @@ def refusals_from_msg(message: Image) -> NDArray[np.uint8]:
     return codes.reshape(message.height, message.width)
 
 
-def report_to_msg(product: Product, stack: Stack) -> ScanReport:
+def report_to_msg(product: Product, stack: Stack) -> Any:
     """Say what a stack gave: counts, figures and hashes (times and attempts are the node's)."""
     cloud = product.cloud
     rows, columns = cloud.points.shape
-    return ScanReport(
+    return ros_message(
+        REPORT.msgtype,
         scan_id=stack.scan_id,
         sequence=stack.sequence.name,
         attempts=1,
@@ -187,7 +94,10 @@ def report_to_msg(product: Product, stack: Stack) -> ScanReport:
         columns=columns,
         points=cloud.present,
         lit_positions=cloud.lit,
-        refused=[RefusalCount(reason=r, count=n) for r, n in sorted(cloud.refused.items())],
+        refused=[
+            ros_message("sl_interfaces/msg/RefusalCount", reason=reason, count=count)
+            for reason, count in sorted(cloud.refused.items())
+        ],
         median_sigma_m=cloud.median_sigma_m,
         edge_sigma_px=cloud.figures.edge_sigma_px,
         edge_bound_px=cloud.figures.edge_bound_px,
@@ -198,7 +108,7 @@ def report_to_msg(product: Product, stack: Stack) -> ScanReport:
     )
 
 
-def cloud_from_msg(message: PointCloud2) -> NDArray[Any]:
+def cloud_from_msg(message: Any) -> NDArray[Any]:
     """View of a cloud message as a structured array (rows, columns).
 
     Raises
@@ -206,7 +116,7 @@ def cloud_from_msg(message: PointCloud2) -> NDArray[Any]:
     StackError
         When fields and lengths do not fit each other.
     """
-    types = {PointField.FLOAT32: "<f4", PointField.FLOAT64: "<f8"}
+    types = {_FLOAT32: "<f4", _FLOAT64: "<f8"}
     if any(f.datatype not in types for f in message.fields) or message.is_bigendian:
         raise StackError("cloud message: expected little-endian float fields only")
     layout: Any = {
@@ -225,8 +135,10 @@ def cloud_from_msg(message: PointCloud2) -> NDArray[Any]:
     return np.frombuffer(message.data, dtype).reshape(message.height, message.width)
 
 
-def rig_to_msg(calibration: Calibration, source: str, stamp_ns: int) -> RigCalibration:
-    """Return the calibration in force as a message.
+def rig_to_msg(
+    calibration: Calibration, source: str, stamp_ns: int, make: MakeMessage = ros_message
+) -> Any:
+    """Return the calibration in force as a ``sl_interfaces/RigCalibration``.
 
     Parameters
     ----------
@@ -236,80 +148,84 @@ def rig_to_msg(calibration: Calibration, source: str, stamp_ns: int) -> RigCalib
         Where it was read from.
     stamp_ns : int
         When it came in force.
+    make : MakeMessage
+        Where messages come from.
     """
-    rig = calibration.rig
-    message = RigCalibration(
+    camera, projector = calibration.rig.camera, calibration.rig.projector
+    return make(
+        CALIBRATION.msgtype,
+        header=header(stamp_ns, WORLD_FRAME, make),
         hash=calibration.hash,
         source=source,
         yaml=dump_calibration(calibration),
-        camera=camera_info(rig.camera, CAMERA_FRAME, stamp_ns),
-        projector=camera_info(rig.projector, PROJECTOR_FRAME, stamp_ns),
-        camera_from_world=pose(rig.camera.rotation, rig.camera.translation_m),
-        projector_from_world=pose(rig.projector.rotation, rig.projector.translation_m),
+        camera=camera_info(camera, CAMERA_FRAME, stamp_ns, make),
+        projector=camera_info(projector, PROJECTOR_FRAME, stamp_ns, make),
+        camera_from_world=_device_from_world(camera, make),
+        projector_from_world=_device_from_world(projector, make),
     )
-    message.header.stamp = stamp_to_msg(stamp_ns)
-    message.header.frame_id = WORLD_FRAME
-    return message
 
 
-def camera_info(device: Device, frame_id: str, stamp_ns: int) -> CameraInfo:
-    """Describe a device to tools that know OpenCV's model; see `plumb_bob` for its error."""
+def _device_from_world(device: Device, make: MakeMessage) -> Any:
+    return rigid_to_msg(device.translation_m, quaternion_xyzw(device.rotation), make)
+
+
+def camera_info(
+    device: Device, frame_id: str, stamp_ns: int, make: MakeMessage = ros_message
+) -> Any:
+    """Describe a device to tools that know OpenCV's model; see `plumb_bob` for its error.
+
+    Parameters
+    ----------
+    device : Device
+        Camera or projector.
+    frame_id : str
+        Its frame.
+    stamp_ns : int
+        When its calibration came in force.
+    make : MakeMessage
+        Where messages come from.
+    """
     lens, _ = plumb_bob(device)
     width, height = device.image_size
     matrix = device.camera_matrix
-    info = CameraInfo(
+    whole = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
+    return make(
+        CAMERA_INFO.msgtype,
+        header=header(stamp_ns, frame_id, make),
         height=height,
         width=width,
         distortion_model="plumb_bob",
-        d=[float(k) for k in lens.coefficients],
-        k=matrix.ravel().tolist(),
-        r=np.eye(3).ravel().tolist(),
-        p=np.hstack([matrix, np.zeros((3, 1))]).ravel().tolist(),
+        d=np.array(lens.coefficients),
+        k=matrix.ravel(),
+        r=np.eye(3).ravel(),
+        p=np.hstack([matrix, np.zeros((3, 1))]).ravel(),
+        binning_x=0,
+        binning_y=0,
+        roi=make("sensor_msgs/msg/RegionOfInterest", do_rectify=False, **whole),
     )
-    info.header.frame_id = frame_id
-    info.header.stamp = stamp_to_msg(stamp_ns)
-    return info
 
 
-def pose(rotation: Array, translation_m: Array) -> Pose:
-    """Rotation matrix and translation as a message."""
-    message = Pose()
-    p, q = message.position, message.orientation
-    p.x, p.y, p.z = (float(v) for v in translation_m)
-    q.x, q.y, q.z, q.w = quaternion_xyzw(rotation)
-    return message
-
-
-def frames_of(rig: Rig) -> list[TransformStamped]:
+def frames_of(rig: Rig) -> list[Any]:
     """Where camera and projector stand in the world, for tf: parent is the world."""
     transforms = []
     for device, name in ((rig.camera, CAMERA_FRAME), (rig.projector, PROJECTOR_FRAME)):
-        transform = TransformStamped(child_frame_id=name)
-        transform.header.frame_id = WORLD_FRAME
-        x, y, z = (float(v) for v in device.position_m)
-        transform.transform.translation = Vector3(x=x, y=y, z=z)
-        qx, qy, qz, qw = quaternion_xyzw(device.rotation.T)
-        transform.transform.rotation = Quaternion(x=qx, y=qy, z=qz, w=qw)
-        transforms.append(transform)
+        world_from_device = rigid_to_msg(device.position_m, quaternion_xyzw(device.rotation.T))
+        at = world_from_device.position
+        transforms.append(
+            ros_message(
+                "geometry_msgs/msg/TransformStamped",
+                header=header(0, WORLD_FRAME),
+                child_frame_id=name,
+                transform=ros_message(
+                    "geometry_msgs/msg/Transform",
+                    translation=ros_message("geometry_msgs/msg/Vector3", x=at.x, y=at.y, z=at.z),
+                    rotation=world_from_device.orientation,
+                ),
+            )
+        )
     return transforms
 
 
-def quaternion_xyzw(rotation: Array) -> tuple[float, float, float, float]:
-    """Unit quaternion of a rotation matrix, w >= 0; stable for every angle (Shepperd 1978)."""
-    trace = float(np.trace(rotation))
-    diagonal = np.append(np.diag(rotation), trace)
-    i = int(np.argmax(diagonal))
-    q = np.empty(4)
-    if i == 3:
-        q[:3] = [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0],
-                 rotation[1, 0] - rotation[0, 1]]  # fmt: skip
-        q[3] = 1 + trace
-    else:
-        j, k = (i + 1) % 3, (i + 2) % 3
-        q[i] = 1 + 2 * rotation[i, i] - trace
-        q[j] = rotation[j, i] + rotation[i, j]
-        q[k] = rotation[k, i] + rotation[i, k]
-        q[3] = rotation[k, j] - rotation[j, k]
-    q *= (1.0 if q[3] >= 0 else -1.0) / np.linalg.norm(q)
-    x, y, z, w = (float(v) for v in q)
-    return x, y, z, w
+def quaternion_xyzw(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit quaternion (4,) of a rotation matrix (3, 3), w >= 0."""
+    return np.asarray(Rotation.from_matrix(rotation).as_quat(canonical=True))

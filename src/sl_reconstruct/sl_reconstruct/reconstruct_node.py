@@ -24,18 +24,12 @@ from sl_interfaces.msg import MatchedFrame, PatternStack, RigCalibration, ScanRe
 from sl_common import topics
 from sl_common.base_node import Health, RigNode, next_scan_id, run
 from sl_common.errors import CalibrationError, ConfigError, SlError, StackError
-from sl_projector.sequence.messages import stamp_from_msg
+from sl_common.messages import stamp_from_msg
+from sl_projector.sequence.messages import image_to_msg, stack_from_msg
+from sl_projector.sequence.stack import Stack
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.measure_service_node import MeasureService
-from sl_reconstruct.messages import (
-    Stack,
-    cloud_to_msg,
-    frames_of,
-    refusals_to_msg,
-    report_to_msg,
-    rig_to_msg,
-    stack_from_msg,
-)
+from sl_reconstruct.messages import cloud_to_msg, frames_of, report_to_msg, rig_to_msg
 from sl_reconstruct.model.calibration_file import Calibration, load_calibration, parse_calibration
 from sl_reconstruct.projector_client_node import ProjectorClient
 from sl_reconstruct.reconstruction.reconstructor_cache import (
@@ -313,14 +307,14 @@ class ReconstructNode(RigNode):
             raise CalibrationError(f"no calibration is in force: {self._calibration_fault}")
         began_s = time.perf_counter()
         # The images are let go before the cloud is published, which needs as much memory again.
-        product = self._workshop(stack.take_images(), stack.sequence)
+        product = self._workshop(stack.release_images(), stack.sequence)
         computed_s = time.perf_counter() - began_s
         good, reasons = verdict(product.cloud)
         if not good:
             raise ScanFailed(f"no cloud is published: {'; '.join(reasons)}")
         stamp_ns = stack.stamps_ns[0]
-        self._refusals.publish(refusals_to_msg(product.cloud.reason, stamp_ns, topics.CAMERA_FRAME))
-        self._clouds.publish(cloud_to_msg(product.cloud.points, stamp_ns, topics.WORLD_FRAME))
+        self._refusals.publish(image_to_msg(product.cloud.reason, stamp_ns))
+        self._clouds.publish(cloud_to_msg(product.cloud.points, stamp_ns))
         self._measuring.remember(product.cloud.points, stamp_ns)
         done_ns = time.time_ns()
         report = report_to_msg(product, stack)

@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from sl_bringup.bag.bags import Bag, Recorded
-from sl_camera.sync.matching import FrameDecision, StackMatcher
-from sl_camera.sync.message_fields import image_event, pose_event, trigger_event
+from sl_camera.messages import image_event, trigger_event
+from sl_camera.sync.match_events import FrameDecision
+from sl_camera.sync.matching import StackMatcher
 from sl_common.errors import SequenceError
 from sl_common.topics import IMAGE, POSE, TRIGGER
+from sl_projector.sequence.messages import pose_from_msg
 
 #: At the end of a bag time passes until every scan has its verdict.
 END_NS = 3_600_000_000_000
@@ -40,7 +42,7 @@ def _feed(bag: Bag, matcher: StackMatcher, recorded: Recorded, now_ns: int) -> l
     if recorded.topic == IMAGE:
         return matcher.image(image_event(recorded.message), now_ns)
     if recorded.topic == POSE:
-        return matcher.pose(pose_event(recorded.message), now_ns)
+        return matcher.pose(pose_from_msg(recorded.message), now_ns)
     try:
         event = trigger_event(recorded.message)
     except SequenceError as exc:

@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import (
     Connection,
@@ -25,25 +24,15 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
-from scipy.spatial.transform import Rotation
 
-from sl_bringup.bag.bags import message_class, typestore
+from sl_bringup.bag.bags import make_message, typestore
 from sl_common.errors import BagError
-from sl_common.topics import (
-    CALIBRATION,
-    CAMERA_FRAME,
-    IMAGE,
-    NAMESPACE,
-    POSE,
-    PROJECTOR_FRAME,
-    TRIGGER,
-    WORLD_FRAME,
-    Topic,
-)
+from sl_common.topics import CALIBRATION, IMAGE, NAMESPACE, POSE, TRIGGER, Topic
+from sl_projector.sequence.messages import image_to_msg, pose_to_msg, trigger_to_msg
 from sl_projector.sequence.pattern_sequence import PatternSequence
-from sl_reconstruct.model.calibration_file import Calibration, dump_calibration
-from sl_reconstruct.model.opencv_lens import plumb_bob
-from sl_reconstruct.model.rig import Device
+from sl_projector.sequence.stack import StagePose
+from sl_reconstruct.messages import rig_to_msg
+from sl_reconstruct.model.calibration_file import Calibration
 
 Storage = Literal["mcap", "sqlite3"]
 
@@ -76,7 +65,17 @@ class BagWriter:
         self._connections: dict[Topic, Connection] = {}
 
     def write(self, topic: Topic, stamp_ns: int, message: Any) -> None:
-        """Write one message, recorded at ``stamp_ns``."""
+        """Write one message.
+
+        Parameters
+        ----------
+        topic : Topic
+            Of what topic.
+        stamp_ns : int
+            When it is said to have been recorded.
+        message : object
+            Of `make_message`.
+        """
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
                 f"{self._namespace}/{topic.name}",
@@ -90,106 +89,38 @@ class BagWriter:
     def trigger(
         self, sequence: PatternSequence, index: int, scan_id: int, stamp_ns: int, exposure_s: float
     ) -> None:
-        """Write that pattern ``index`` began to be exposed at ``stamp_ns``."""
-        pattern = sequence.patterns[index]
-        message = message_class(TRIGGER.msgtype)(
-            header=header(stamp_ns, PROJECTOR_FRAME),
-            scan_id=scan_id,
-            sequence=sequence.name,
-            dmd_columns=sequence.dmd_size[0],
-            dmd_rows=sequence.dmd_size[1],
-            index=index,
-            count=len(sequence),
-            pattern=message_class("sl_interfaces/msg/Pattern")(
-                kind=pattern.kind,
-                axis=pattern.axis,
-                bit=pattern.bit,
-                bits=pattern.bits,
-                division_px=pattern.division_px,
-                shift_px=pattern.shift_px,
-                inverted=pattern.inverted,
-            ),
-            exposure_s=exposure_s,
-        )
+        """Write that a pattern began to be exposed; see `trigger_to_msg` for the arguments."""
+        message = trigger_to_msg(sequence, index, scan_id, stamp_ns, exposure_s, make_message)
         self.write(TRIGGER, stamp_ns, message)
 
     def image(self, image: NDArray[Any], stamp_ns: int, received_ns: int) -> None:
-        """Write a camera frame, (H, W) uint8 or uint16, exposed from ``stamp_ns`` on."""
-        wide = image.dtype == np.uint16
-        message = message_class(IMAGE.msgtype)(
-            header=header(stamp_ns, CAMERA_FRAME),
-            height=image.shape[0],
-            width=image.shape[1],
-            encoding="mono16" if wide else "mono8",
-            is_bigendian=0,
-            step=image.shape[1] * image.itemsize,
-            data=np.ascontiguousarray(image).view(np.uint8).reshape(-1),
-        )
-        self.write(IMAGE, received_ns, message)
+        """Write a camera frame.
+
+        Parameters
+        ----------
+        image : ndarray, (H, W), uint8 or uint16
+            The frame.
+        stamp_ns, received_ns : int
+            Start of its exposure, and when it came.
+        """
+        self.write(IMAGE, received_ns, image_to_msg(image, stamp_ns, make_message))
 
     def pose(self, position_m: tuple[float, float, float], stamp_ns: int) -> None:
-        """Write where the stage stood at ``stamp_ns``, metres in the world."""
-        x, y, z = position_m
-        message = message_class(POSE.msgtype)(
-            header=header(stamp_ns, WORLD_FRAME), pose=_pose((x, y, z), (0.0, 0.0, 0.0, 1.0))
-        )
-        self.write(POSE, stamp_ns, message)
+        """Write where the stage stood.
+
+        Parameters
+        ----------
+        position_m : tuple of float
+            Metres in the world.
+        stamp_ns : int
+            When.
+        """
+        self.write(POSE, stamp_ns, pose_to_msg(StagePose(stamp_ns, position_m), make_message))
 
     def calibration(self, calibration: Calibration, source: str, stamp_ns: int) -> None:
-        """Write the calibration in force, as the graph latches it."""
-        rig = calibration.rig
-        message = message_class(CALIBRATION.msgtype)(
-            header=header(stamp_ns, WORLD_FRAME),
-            hash=calibration.hash,
-            source=source,
-            yaml=dump_calibration(calibration),
-            camera=_camera_info(rig.camera, CAMERA_FRAME, stamp_ns),
-            projector=_camera_info(rig.projector, PROJECTOR_FRAME, stamp_ns),
-            camera_from_world=_pose(rig.camera.translation_m, _quaternion(rig.camera)),
-            projector_from_world=_pose(rig.projector.translation_m, _quaternion(rig.projector)),
-        )
+        """Write the calibration in force; see `rig_to_msg` for the arguments."""
+        message = rig_to_msg(calibration, source, stamp_ns, make_message)
         self.write(CALIBRATION, stamp_ns, message)
-
-
-def header(stamp_ns: int, frame_id: str) -> Any:
-    """Build a std_msgs/Header."""
-    sec, nanosec = divmod(stamp_ns, 1_000_000_000)
-    stamp = message_class("builtin_interfaces/msg/Time")(sec=sec, nanosec=nanosec)
-    return message_class("std_msgs/msg/Header")(stamp=stamp, frame_id=frame_id)
-
-
-def _pose(position_m: Any, quaternion: Any) -> Any:
-    x, y, z = (float(v) for v in position_m)
-    qx, qy, qz, qw = (float(v) for v in quaternion)
-    return message_class("geometry_msgs/msg/Pose")(
-        position=message_class("geometry_msgs/msg/Point")(x=x, y=y, z=z),
-        orientation=message_class("geometry_msgs/msg/Quaternion")(x=qx, y=qy, z=qz, w=qw),
-    )
-
-
-def _quaternion(device: Device) -> Any:
-    return Rotation.from_matrix(device.rotation).as_quat()
-
-
-def _camera_info(device: Device, frame_id: str, stamp_ns: int) -> Any:
-    """CameraInfo, with the nearest lens that OpenCV has a name for."""
-    lens, _ = plumb_bob(device)
-    k = device.camera_matrix
-    return message_class("sensor_msgs/msg/CameraInfo")(
-        header=header(stamp_ns, frame_id),
-        width=device.image_size[0],
-        height=device.image_size[1],
-        distortion_model="plumb_bob",
-        d=np.array(lens.coefficients),
-        k=k.reshape(-1),
-        r=np.eye(3).reshape(-1),
-        p=np.hstack([k, np.zeros((3, 1))]).reshape(-1),
-        binning_x=0,
-        binning_y=0,
-        roi=message_class("sensor_msgs/msg/RegionOfInterest")(
-            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        ),
-    )
 
 
 @contextmanager

@@ -66,9 +66,9 @@ def typestore() -> Typestore:
     return store
 
 
-def message_class(msgtype: str) -> Any:
-    """Class of a message type, to be filled with keyword arguments."""
-    return typestore().types[msgtype]
+def make_message(msgtype: str, **fields: Any) -> Any:
+    """Make a message without ROS; see `sl_common.messages.MakeMessage`."""
+    return typestore().types[msgtype](**fields)
 
 
 @dataclass(frozen=True)

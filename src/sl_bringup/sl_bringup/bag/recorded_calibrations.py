@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sl_bringup.bag.bags import Bag, Recorded
-from sl_camera.sync.matching import MatchedStack
 from sl_common.errors import CalibrationError, SlError
 from sl_common.topics import CALIBRATION
+from sl_projector.sequence.stack import Stack
 from sl_reconstruct.model.calibration_file import Calibration, load_calibration, parse_calibration
 
 
@@ -62,14 +62,13 @@ class Calibrations:
                 f"{bag.namespace}/{CALIBRATION.name} in the bag, or --calibration FILE"
             )
 
-    def of(self, stack: MatchedStack) -> InForce:
+    def of(self, stack: Stack) -> InForce:
         """Calibration of a stack; a file may need the sizes that only the stack knows."""
-        recorded = self._recorded_at(stack.image_stamps_ns[0])
+        recorded = self._recorded_at(stack.stamps_ns[0])
         if self._file is None:
             assert recorded is not None
             return recorded
-        _, height, width = stack.data.shape
-        found = self._from_file(self._file, (width, height), stack.sequence.dmd_size)
+        found = self._from_file(self._file, stack.image_size, stack.sequence.dmd_size)
         differs = recorded is not None and recorded.calibration.hash != found.hash
         mismatch = (
             f"{self._file} ({found.hash[:12]}) is used, though the bag holds another calibration "

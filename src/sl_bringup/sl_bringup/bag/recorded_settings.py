@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from sl_bringup.bag.bags import Bag
-from sl_camera.sync.matching import MatcherSettings
+from sl_camera.sync.match_events import MatcherSettings
 from sl_common.errors import BagError, ConfigError
 from sl_common.topics import CAMERA_SETTINGS, MATCHING, SETTINGS, Topic
 from sl_reconstruct.decode.settings import Settings

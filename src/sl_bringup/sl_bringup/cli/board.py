@@ -11,8 +11,10 @@ from sl_bringup.bag.bag_matching import decisions
 from sl_bringup.bag.bags import open_bag
 from sl_bringup.bag.recorded_settings import read_settings
 from sl_bringup.graph.console import complain, say
-from sl_camera.sync.matching import MatchedStack, StackMatcher, Status
+from sl_camera.sync.match_events import Status
+from sl_camera.sync.matching import StackMatcher
 from sl_common.errors import CalibrationError, ConfigError
+from sl_projector.sequence.stack import Stack
 
 
 def add_parser(subparsers: Any) -> None:
@@ -68,12 +70,11 @@ def run(args: argparse.Namespace) -> int:
     views, names, sizes = [], [], ((0, 0), (0, 0))
     for stack in _stacks(args.bag, args.namespace):
         try:
-            views.append(board_view(stack.data, stack.sequence, board))
+            views.append(board_view(stack.images, stack.sequence, board))
         except CalibrationError as error:
             raise CalibrationError(f"scan {stack.scan_id}: {error}") from error
         names.append(stack.scan_id)
-        height, width = stack.data.shape[1:]
-        sizes = ((width, height), stack.sequence.dmd_size)
+        sizes = (stack.image_size, stack.sequence.dmd_size)
         say(f"scan {stack.scan_id}: {len(views[-1].camera_px)} corners")
     camera, dmd = (Sensor(size, p * 1e-6) for size, p in zip(sizes, args.pitch_um, strict=True))
     solution = solve_board(views, board, (camera, dmd), args.coefficients)
@@ -93,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _stacks(path: Path, namespace: str | None) -> Iterator[MatchedStack]:
+def _stacks(path: Path, namespace: str | None) -> Iterator[Stack]:
     """Yield the complete stacks of a recording; their memory is used again afterwards."""
     with open_bag(path, namespace) as bag:
         matcher = StackMatcher(read_settings(bag).matching)

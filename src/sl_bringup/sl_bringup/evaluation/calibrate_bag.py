@@ -16,17 +16,19 @@ from sl_bringup.bag.bags import Bag, open_bag
 from sl_bringup.bag.recorded_settings import read_settings
 from sl_calibration.data.observations import Observations, View, save_observations
 from sl_calibration.data.run_store import OBSERVATIONS
-from sl_calibration.data.session import CalibrationRequest, Taken
+from sl_calibration.data.session import CalibrationRequest
 from sl_calibration.data.view_extraction import observe
 from sl_calibration.solve.acceptance import Limits
 from sl_calibration.target.plate import DEFAULT_PLATE, Plate
 from sl_calibration.workflow.conclusion import Outcome, conclude
 from sl_calibration.workflow.run_record import Pitches, RunRecord, made_from_request
-from sl_camera.sync.matching import MatchedStack, StackMatcher, Status
+from sl_camera.sync.match_events import Status
+from sl_camera.sync.matching import StackMatcher
 from sl_common.errors import CalibrationError
 from sl_common.topics import CALIBRATION_RUN
+from sl_projector.sequence.stack import Stack
 
-Look = Callable[[Taken, CalibrationRequest], View]
+Look = Callable[[Stack, CalibrationRequest], View]
 Tell = Callable[[str], None]
 
 
@@ -105,8 +107,8 @@ def _observations(bag: Bag, run: RunRecord, look: Look, tell: Tell) -> Observati
     views: dict[int, View] = {}
     sizes = (0, 0), (0, 0)
     for stack in _stacks(bag, run):
-        sizes = image_size(stack), stack.sequence.dmd_size
-        views[stack.scan_id] = look(_taken(stack), run.request)
+        sizes = stack.image_size, stack.sequence.dmd_size
+        views[stack.scan_id] = look(stack, run.request)
         tell(f"scan {stack.scan_id}: {len(views[stack.scan_id].hole_ids)} holes")
     if missing := [number for number in run.scan_ids if number not in views]:
         raise CalibrationError(
@@ -123,7 +125,7 @@ def _observations(bag: Bag, run: RunRecord, look: Look, tell: Tell) -> Observati
     return run.observations(ordered, *sizes)
 
 
-def _stacks(bag: Bag, run: RunRecord) -> Iterator[MatchedStack]:
+def _stacks(bag: Bag, run: RunRecord) -> Iterator[Stack]:
     """Yield the stacks of a run; their memory is used again afterwards."""
     matcher = StackMatcher(read_settings(bag).matching)
     for decision in decisions(bag, matcher):
@@ -135,21 +137,6 @@ def _stacks(bag: Bag, run: RunRecord) -> Iterator[MatchedStack]:
         if wanted:
             yield decision.stack
         matcher.recycle(decision.stack)
-
-
-def image_size(stack: MatchedStack) -> tuple[int, int]:
-    """(width, height) of a stack's images."""
-    _, height, width = stack.data.shape
-    return width, height
-
-
-def _taken(stack: MatchedStack) -> Taken:
-    if stack.pose is None:
-        raise CalibrationError(
-            f"scan {stack.scan_id} has no stage pose; expected one with every stack"
-        )
-    x, y, z = stack.pose.position_m
-    return Taken(stack.data, stack.sequence, z, (x, y), stack.scan_id)
 
 
 def _compared(run: RunRecord, outcome: Outcome) -> list[str]:

@@ -25,9 +25,11 @@ from sl_bringup.graph.version import software_version
 from sl_bringup.results.report import write_json, write_page
 from sl_bringup.results.result_folder import clear_results, write_summary
 from sl_bringup.results.scan_files import write_scan
-from sl_camera.sync.matching import FrameDecision, MatchedStack, StackMatcher, Status
+from sl_camera.sync.match_events import FrameDecision, Status
+from sl_camera.sync.matching import StackMatcher
 from sl_common.errors import BagError, CalibrationError, SlError
 from sl_common.topics import TRIGGER
+from sl_projector.sequence.stack import Stack
 from sl_reconstruct.cloud.cloud import Cloud, median
 from sl_reconstruct.cloud.cloud_writer import cloud_hash
 from sl_reconstruct.decode.full_scale import saturation_of
@@ -241,26 +243,26 @@ class _BagRun:
         recorded = self._recorded.of(self._live.settings_hash(scan_id))
         return parse_choices(self._choices.assignments, recorded)[0]
 
-    def _measure(self, report: Report, stack: MatchedStack, settings: Settings) -> Cloud:
+    def _measure(self, report: Report, stack: Stack, settings: Settings) -> Cloud:
         """Reconstruct a stack and put what was found into the report."""
         in_force = self._calibrations.of(stack)
         report.update(_origin(stack, in_force))
-        report["saturation_dn"] = saturation_of(stack.data, settings)
+        report["saturation_dn"] = saturation_of(stack.images, settings)
         notes = in_force.mismatch, _guessed(stack, settings, report["saturation_dn"])
         report["notes"] = [note for note in notes if note]
         workshop = self._workshops.of(in_force, settings)
-        cloud = workshop(stack.data, stack.sequence, report["saturation_dn"]).cloud
+        cloud = workshop(stack.images, stack.sequence, report["saturation_dn"]).cloud
         report.update(_result(cloud))
         report["live"] = self._live.compare(report)
         return cloud
 
     def _write(
-        self, folder: Path, report: Report, cloud: Cloud | None, stack: MatchedStack | None,
+        self, folder: Path, report: Report, cloud: Cloud | None, stack: Stack | None,
         first: bool,
     ) -> None:  # fmt: skip
         pictures = self._choices.pictures
         wanted = pictures == "all" or (pictures == "first" and first)
-        drawn = write_scan(folder, report, cloud, wanted, stack.data if stack else None)
+        drawn = write_scan(folder, report, cloud, wanted, stack.images if stack else None)
         write_json(folder / "report.json", report)
         if pictures != "none":
             write_page(folder / "report.html", report, drawn)
@@ -289,20 +291,20 @@ class Workshops:
             return self._made[key]
 
 
-def _origin(stack: MatchedStack, in_force: InForce) -> Report:
-    count, height, width = stack.data.shape
+def _origin(stack: Stack, in_force: InForce) -> Report:
+    count, height, width = stack.images.shape
     return {
         "sequence": stack.sequence.name,
         "dmd_size": stack.sequence.dmd_size,
         "images": f"{count} of {width} x {height}, {stack.encoding}",
-        "stamp_ns": stack.image_stamps_ns[0],
+        "stamp_ns": stack.stamps_ns[0],
         "exposure_s": stack.exposure_s,
         "calibration_hash": in_force.calibration.hash,
         "calibration_source": in_force.source,
     }
 
 
-def _guessed(stack: MatchedStack, settings: Settings, saturation_dn: int) -> str:
+def _guessed(stack: Stack, settings: Settings, saturation_dn: int) -> str:
     """Say where saturation begins when only the values show it; empty when it is known."""
     if settings.saturation_dn or stack.encoding == "mono8":
         return ""

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from sl_camera.sync.matching import MatcherSettings
+from sl_camera.sync.match_events import MatcherSettings
 from sl_common.errors import ConfigError
 from sl_reconstruct.decode.settings import Settings
 

@@ -11,15 +11,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sl_calibration.data.observations import View
 from sl_calibration.target.plate import Plate
 from sl_common.errors import CalibrationError, SlError
-from sl_projector.sequence.pattern_sequence import PatternSequence
+from sl_projector.sequence.stack import Stack
 
 #: Fewer heights leave nothing to check the solution with (leave one out).
 MIN_HEIGHTS = 3
@@ -104,36 +103,6 @@ class CalibrationRequest:
 
 
 @dataclass(frozen=True)
-class Taken:
-    """A complete stack and where the stage stood.
-
-    Parameters
-    ----------
-    images : ndarray, (N, H, W), uint8 or uint16
-        In pattern order.
-    sequence : PatternSequence
-        What was projected.
-    height_m : float
-        Stage z of the stack's pose, metres.
-    xy_m : tuple of float
-        Stage x and y, metres.
-    scan_id : int
-        The stack's number; 0 where it has none.
-    """
-
-    images: NDArray[Any]
-    sequence: PatternSequence
-    height_m: float
-    xy_m: tuple[float, float] = (0.0, 0.0)
-    scan_id: int = 0
-
-    @property
-    def place(self) -> Place:
-        """Where the stage stood."""
-        return (*self.xy_m, self.height_m)
-
-
-@dataclass(frozen=True)
 class CalibrationProgress:
     """How far a run is.
 
@@ -180,7 +149,7 @@ class CalibrationDevices(Protocol):
         """Move to a place, wait, and return where the stage says it stands."""
         ...
 
-    def take(self, sequence: str) -> Taken:
+    def take(self, sequence: str) -> Stack:
         """Project a sequence and return the images."""
         ...
 
@@ -212,7 +181,7 @@ class Session(Generic[_SeenT]):
         self,
         gear: CalibrationDevices,
         order: CalibrationRequest,
-        observe: Callable[[Taken, CalibrationRequest], _SeenT],
+        observe: Callable[[Stack, CalibrationRequest], _SeenT],
         tell: Tell,
         stage_tolerance_m: float = 5e-6,
         compare: Callable[[_SeenT, _SeenT], None] = lambda _before, _after: None,
@@ -274,7 +243,7 @@ class Session(Generic[_SeenT]):
                 self._compare(views[-1], view)
         views.append(view)
 
-    def _take(self, i: int, place: Place) -> Taken:
+    def _take(self, i: int, place: Place) -> Stack:
         self._report("home", i)
         self._check_place(self._gear.move(place), place)
         self._report("planes", i)

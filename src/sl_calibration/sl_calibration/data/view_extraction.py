@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sl_calibration.data.observations import View
-from sl_calibration.data.session import CalibrationRequest, Taken
+from sl_calibration.data.session import CalibrationRequest
 from sl_calibration.target.hole_detection import find_plate
 from sl_common.errors import CalibrationError
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence
+from sl_projector.sequence.stack import Stack
 from sl_reconstruct.decode.full_scale import full_scale_dn
 from sl_reconstruct.reconstruction.correspondence import Correspondences, correspondences
 
@@ -37,7 +38,7 @@ SMOOTH_CELLS = 6.0
 _NO_TARGETS = Correspondences(*np.empty((3, 0, 2)))
 
 
-def observe(taken: Taken, order: CalibrationRequest) -> View:
+def observe(stack: Stack, order: CalibrationRequest) -> View:
     """Measure the plate in one stack.
 
     Without ``order.patterns`` only the holes are looked for, and the view has no targets.
@@ -48,21 +49,21 @@ def observe(taken: Taken, order: CalibrationRequest) -> View:
         When the projector gives no light, the plate is not there or not as it should be, or the
         projector's patterns are not seen on it.
     """
-    check_target_light(taken.images, taken.sequence)
-    full_dn = full_scale_dn(taken.images)
-    white = white_image(taken.images, taken.sequence)
+    check_target_light(stack.images, stack.sequence)
+    full_dn = full_scale_dn(stack.images)
+    white = white_image(stack.images, stack.sequence)
     holes = find_plate(white, order.plate, full_dn)
-    targets = _targets(taken, white) if order.patterns else _NO_TARGETS
+    targets = _targets(stack, white) if order.patterns else _NO_TARGETS
     good = holes.good
     return View(
-        taken.height_m,
+        stack.place[2],
         holes.ids[good], holes.plate_xy_m[good], holes.centres_px[good], holes.sigma_px[good],
-        targets.camera_px, targets.dmd_px, targets.sigma_px, targets.edge_sigma_px, taken.xy_m,
+        targets.camera_px, targets.dmd_px, targets.sigma_px, targets.edge_sigma_px, stack.place[:2],
     )  # fmt: skip
 
 
-def _targets(taken: Taken, white: NDArray[np.float32]) -> Correspondences:
-    found = correspondences(taken.images, taken.sequence)
+def _targets(stack: Stack, white: NDArray[np.float32]) -> Correspondences:
+    found = correspondences(stack.images, stack.sequence)
     if len(found) < MIN_TARGETS:
         raise CalibrationError(
             f"the projector's coordinates were decoded at {len(found)} places; expected at least "

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_calibration.data.session import CalibrationRequest, Taken
+from sl_calibration.data.session import CalibrationRequest
 from sl_calibration.data.view_extraction import MIN_TARGETS, check_target_light, observe
 from sl_calibration.solve.ray_midpoints import triangulate
 from sl_calibration.target.plate import Plate
 from sl_common.errors import CalibrationError
+from sl_projector.sequence.stack import Stack
 from sl_reconstruct.model.calibration_file import Calibration
 from sl_reconstruct.model.rig import Rig
 from sl_reconstruct.reconstruction.correspondence import correspondences
@@ -187,12 +188,12 @@ def default_heights(made_from: Mapping[str, Any], here_m: float) -> tuple[float,
     return float(low + inset), float((low + high) / 2), float(high - inset)
 
 
-def check_rig_on(taken: Taken, target: str, plate: Plate, rig: Rig) -> Check:
+def check_rig_on(stack: Stack, target: str, plate: Plate, rig: Rig) -> Check:
     """Check a rig on one stack.
 
     Parameters
     ----------
-    taken : Taken
+    stack : Stack
         Images of plate or flat under a sequence of both axes.
     target : {"plate", "flat"}
         What lies there.
@@ -207,20 +208,20 @@ def check_rig_on(taken: Taken, target: str, plate: Plate, rig: Rig) -> Check:
         When the target is unknown, the images are not of the rig's size, or there is no light, no
         plate, or too little of the patterns to be seen.
     """
-    size = taken.images.shape[:0:-1]
-    if size != rig.camera.image_size or taken.sequence.dmd_size != rig.projector.image_size:
+    size = stack.images.shape[:0:-1]
+    if size != rig.camera.image_size or stack.sequence.dmd_size != rig.projector.image_size:
         raise CalibrationError(
-            f"images of {size} pixels and patterns of {taken.sequence.dmd_size}; expected "
+            f"images of {size} pixels and patterns of {stack.sequence.dmd_size}; expected "
             f"{rig.camera.image_size} and {rig.projector.image_size}, as in the calibration"
         )
     check_target(target)
     if target == "flat":
-        return check_on(rig, taken.height_m, _seen(taken))
+        return check_on(rig, stack.place[2], _seen(stack))
     view = observe(
-        taken, CalibrationRequest("both", (taken.height_m,), plate, taken.sequence.name, least=1)
+        stack, CalibrationRequest("both", (stack.place[2],), plate, stack.sequence.name, least=1)
     )
     targets, holes = (view.camera_px, view.dmd_px), (view.centres_px, view.plate_xy_m)
-    return check_on(rig, taken.height_m, targets, holes)
+    return check_on(rig, stack.place[2], targets, holes)
 
 
 def check_on(
@@ -257,10 +258,10 @@ def check_target(target: str) -> None:
         raise CalibrationError(f"target={target!r}; expected one of {TARGETS}")
 
 
-def _seen(taken: Taken) -> tuple[Array, Array]:
+def _seen(stack: Stack) -> tuple[Array, Array]:
     """Camera pixels and DMD coordinates on a flat."""
-    check_target_light(taken.images, taken.sequence)
-    found = correspondences(taken.images, taken.sequence)
+    check_target_light(stack.images, stack.sequence)
+    found = correspondences(stack.images, stack.sequence)
     if len(found) < MIN_TARGETS:
         raise CalibrationError(
             f"the projector's coordinates were decoded at {len(found)} places; expected at "

@@ -18,7 +18,6 @@ from sl_calibration.data.session import (
     CalibrationRequest,
     RunCancelled,
     Session,
-    Taken,
     Tell,
     check_motion,
 )
@@ -40,6 +39,7 @@ from sl_calibration.verify.rig_check import (
 from sl_calibration.workflow.conclusion import Outcome, conclude
 from sl_calibration.workflow.run_record import Pitches, RunRecord, made_from_request
 from sl_common.errors import CalibrationError, SlError
+from sl_projector.sequence.stack import Stack
 from sl_reconstruct.model.calibration_file import Calibration
 
 NAN = float("nan")
@@ -113,7 +113,7 @@ class Calibrator:
         pitches: Pitches,
         stage_tolerance_m: float = 5e-6,
         verify_limits: VerifyLimits | None = None,
-        look: Callable[[Taken, CalibrationRequest], View] = observe,
+        look: Callable[[Stack, CalibrationRequest], View] = observe,
         record: Callable[[Mapping[str, Any]], None] = lambda _: None,
     ) -> None:
         self._store, self._limits, self._pitches = store, limits, pitches
@@ -186,12 +186,13 @@ class Calibrator:
         fixed: FixedLens | None,
         tell: Tell,
     ) -> Outcome:
-        stacks: list[Taken] = []
+        stacks: list[Stack] = []
 
-        def look(taken: Taken, asked: CalibrationRequest) -> View:
-            view = self._observe(taken, asked)
+        def look(stack: Stack, asked: CalibrationRequest) -> View:
+            view = self._observe(stack, asked)
             # Sizes and number are needed later; the images would fill the memory.
-            stacks.append(replace(taken, images=np.empty((0, *taken.images.shape[1:]))))
+            stack.release_images()
+            stacks.append(stack)
             return view
 
         request, refused = _within_travel(devices, request)
@@ -207,9 +208,8 @@ class Calibrator:
         self._publish(run, stacks, outcome)
         return outcome
 
-    def _solved(self, views: tuple[View, ...], stack: Taken, run: RunRecord, tell: Tell) -> Outcome:
-        height, width = stack.images.shape[1:]
-        observations = run.observations(views, (width, height), stack.sequence.dmd_size)
+    def _solved(self, views: tuple[View, ...], stack: Stack, run: RunRecord, tell: Tell) -> Outcome:
+        observations = run.observations(views, stack.image_size, stack.sequence.dmd_size)
         folder = self._store.new_run()
         save_observations(folder / OBSERVATIONS, observations)
         tell(CalibrationProgress("solve", len(views), len(views), 0.85))
@@ -221,7 +221,7 @@ class Calibrator:
         tell(CalibrationProgress("store", len(views), len(views), 1.0))
         return outcome
 
-    def _publish(self, run: RunRecord, stacks: list[Taken], outcome: Outcome) -> None:
+    def _publish(self, run: RunRecord, stacks: list[Stack], outcome: Outcome) -> None:
         """Say what it takes to make the run again from a recording of it."""
         if stacks:
             scan_ids = tuple(stack.scan_id for stack in stacks)
@@ -255,8 +255,8 @@ class Calibrator:
         heights_m = heights_m or default_heights(calibration.made_from, devices.where()[2])
         views = CalibrationRequest("both", heights_m, plate, sequence, least=1)
 
-        def look(taken: Taken, _: CalibrationRequest) -> Check:
-            return check_rig_on(taken, target, plate, calibration.rig)
+        def look(stack: Stack, _: CalibrationRequest) -> Check:
+            return check_rig_on(stack, target, plate, calibration.rig)
 
         checks = Session(devices, views, look, lambda _: None, self._stage_tolerance_m).views()
         return self._judged(Findings(checks, stage_z_axis(calibration)), calibration.hash)

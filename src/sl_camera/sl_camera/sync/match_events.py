@@ -9,19 +9,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from enum import IntEnum
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_common.errors import ConfigError
-from sl_common.topics import WORLD_FRAME
-from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence
-
-Pixels: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
-
-#: Pixel type of each encoding that a scan may have.
-PIXEL_TYPES: dict[str, np.dtype[Any]] = {"mono8": np.dtype(np.uint8), "mono16": np.dtype("<u2")}
+from sl_projector.sequence.pattern_sequence import Pattern
+from sl_projector.sequence.stack import PIXEL_TYPES, Pixels, Stack, StagePose
 
 
 class Status(IntEnum):
@@ -114,71 +109,6 @@ class ImageEvent:
 
 
 @dataclass(frozen=True, slots=True)
-class PoseEvent:
-    """Where the part stood.
-
-    Parameters
-    ----------
-    stamp_ns : int
-        When it stood there, host clock.
-    position_m : tuple of float
-        (x, y, z), metres.
-    quaternion_xyzw : tuple of float
-        Unit quaternion.
-    frame_id : str
-        Frame that both are in.
-    """
-
-    stamp_ns: int
-    position_m: tuple[float, float, float]
-    quaternion_xyzw: tuple[float, float, float, float]
-    frame_id: str = WORLD_FRAME
-
-    def fault(self) -> str:
-        """Say why this is not a pose; empty when it is one."""
-        if not all(map(math.isfinite, (*self.position_m, *self.quaternion_xyzw))):
-            return f"the stage pose is not a number: {self.position_m}, {self.quaternion_xyzw}"
-        norm = math.hypot(*self.quaternion_xyzw)
-        if abs(norm - 1.0) > 1e-3:
-            return f"the stage pose has a quaternion of length {norm:.4g}, expected 1"
-        return ""
-
-
-@dataclass(frozen=True, slots=True)
-class MatchedStack:
-    """All images of one scan in pattern order.
-
-    Parameters
-    ----------
-    scan_id : int
-        The scan.
-    sequence : PatternSequence
-        What was projected; one pattern per image.
-    data : ndarray, (N, H, W), uint8 or uint16
-        The images. Hand it back with `StackMatcher.recycle` once it is no longer needed.
-    trigger_stamps_ns, image_stamps_ns : tuple of int
-        Start of each exposure as the projector and the camera say.
-    exposure_s : float
-        Exposure of each pattern, seconds.
-    pose : PoseEvent or None
-        Where the part stood during all exposures; None when no pose was asked for and none came.
-    """
-
-    scan_id: int
-    sequence: PatternSequence
-    data: Pixels
-    trigger_stamps_ns: tuple[int, ...]
-    image_stamps_ns: tuple[int, ...]
-    exposure_s: float
-    pose: PoseEvent | None
-
-    @property
-    def encoding(self) -> str:
-        """Pixel format, "mono8" or "mono16"."""
-        return "mono8" if self.data.dtype == np.uint8 else "mono16"
-
-
-@dataclass(frozen=True, slots=True)
 class FrameDecision:
     """What was decided about one trigger or image, or (STACK_*) about a whole scan.
 
@@ -192,9 +122,9 @@ class FrameDecision:
         In words; empty when MATCHED.
     trigger_stamp_ns, image_stamp_ns : int
         0 where there is none.
-    pose : PoseEvent or None
+    pose : StagePose or None
         The newest pose not later than the exposure, or the stack's.
-    stack : MatchedStack or None
+    stack : Stack or None
         With STACK_COMPLETE only.
     """
 
@@ -205,8 +135,8 @@ class FrameDecision:
     reason: str = ""
     trigger_stamp_ns: int = 0
     image_stamp_ns: int = 0
-    pose: PoseEvent | None = None
-    stack: MatchedStack | None = None
+    pose: StagePose | None = None
+    stack: Stack | None = None
 
     @property
     def stamp_ns(self) -> int:

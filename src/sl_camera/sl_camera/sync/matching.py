@@ -17,20 +17,13 @@ import numpy as np
 from sl_camera.sync.match_events import (
     FrameDecision,
     ImageEvent,
-    MatchedStack,
     MatcherSettings,
-    Pixels,
-    PoseEvent,
     Status,
     TriggerEvent,
 )
 from sl_camera.sync.pose_track import PoseTrack
 from sl_camera.sync.scan_assembly import ScanRecord
-
-__all__ = [
-    "FrameDecision", "ImageEvent", "MatchedStack", "MatcherSettings", "PoseEvent", "StackMatcher",
-    "Status", "TriggerEvent",
-]  # fmt: skip
+from sl_projector.sequence.stack import Pixels, Stack, StagePose
 
 #: Scans whose triggers and images may still be coming.
 MAX_OPEN = 2
@@ -99,7 +92,7 @@ class StackMatcher:
             decisions.append(self._foreign(self._waiting.popleft()))
         return [*decisions, *self._advance(now_ns)]
 
-    def pose(self, event: PoseEvent, now_ns: int) -> list[FrameDecision]:
+    def pose(self, event: StagePose, now_ns: int) -> list[FrameDecision]:
         """Take a pose; the first one after a scan's last exposure may complete it."""
         decisions = list(self._advance(now_ns))
         self._poses.add(event)
@@ -109,9 +102,9 @@ class StackMatcher:
         """Let time pass; call it every few milliseconds, and late once at the end of a bag."""
         return list(self._advance(now_ns))
 
-    def recycle(self, stack: MatchedStack) -> None:
+    def recycle(self, stack: Stack) -> None:
         """Take the memory of a stack back that nobody uses any more."""
-        self._keep(stack.data)
+        self._keep(stack.images)
 
     @property
     def busy(self) -> bool:
@@ -287,7 +280,7 @@ class StackMatcher:
         yield self._verdict(scan, pose)
         self._closed.append(scan)
 
-    def _verdict(self, scan: ScanRecord, pose: PoseEvent | None) -> FrameDecision:
+    def _verdict(self, scan: ScanRecord, pose: StagePose | None) -> FrameDecision:
         if scan.problems:
             self._keep(scan.data)
             verdict = scan.decide(Status.STACK_REFUSED, 0, scan.reason())

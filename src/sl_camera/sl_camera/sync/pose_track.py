@@ -6,7 +6,8 @@ import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 
-from sl_camera.sync.match_events import MatcherSettings, PoseEvent
+from sl_camera.sync.match_events import MatcherSettings
+from sl_projector.sequence.stack import StagePose
 
 #: Poses kept; at 100 Hz more than a minute.
 HISTORY = 8192
@@ -17,10 +18,10 @@ class PoseTrack:
 
     def __init__(self, settings: MatcherSettings) -> None:
         self._settings = settings
-        self._poses: list[PoseEvent] = []
+        self._poses: list[StagePose] = []
         self._stamps: list[int] = []
 
-    def add(self, pose: PoseEvent) -> None:
+    def add(self, pose: StagePose) -> None:
         """Take a pose; a late one is put in its place."""
         at = bisect_right(self._stamps, pose.stamp_ns)
         self._stamps.insert(at, pose.stamp_ns)
@@ -29,7 +30,7 @@ class PoseTrack:
             # Half at once, so that a long run does not move the list with every pose.
             del self._poses[: HISTORY // 2], self._stamps[: HISTORY // 2]
 
-    def at(self, stamp_ns: int) -> PoseEvent | None:
+    def at(self, stamp_ns: int) -> StagePose | None:
         """Newest pose not later than a time, None when there is none."""
         before = bisect_right(self._stamps, stamp_ns)
         return self._poses[before - 1] if before else None
@@ -38,13 +39,13 @@ class PoseTrack:
         """Tell whether a pose at or after a time has come."""
         return bool(self._stamps) and self._stamps[-1] >= end_ns
 
-    def during(self, start_ns: int, end_ns: int) -> list[PoseEvent]:
+    def during(self, start_ns: int, end_ns: int) -> list[StagePose]:
         """Poses from the last at or before the start to the first at or after the end."""
         first = max(bisect_right(self._stamps, start_ns) - 1, 0)
         last = bisect_left(self._stamps, end_ns)
         return self._poses[first : last + 1]
 
-    def stood(self, start_ns: int, end_ns: int) -> tuple[PoseEvent | None, str]:
+    def stood(self, start_ns: int, end_ns: int) -> tuple[StagePose | None, str]:
         """Where the part stood from start to end, and why that cannot be said (or "").
 
         Without `require_pose` the poses may be missing; those that are there must agree.
@@ -57,7 +58,7 @@ class PoseTrack:
         middle = (start_ns + end_ns) // 2
         return min(poses, key=lambda p: abs(p.stamp_ns - middle)), ""
 
-    def _gap(self, poses: Sequence[PoseEvent], start_ns: int, end_ns: int) -> str:
+    def _gap(self, poses: Sequence[StagePose], start_ns: int, end_ns: int) -> str:
         if not self._settings.require_pose:
             return ""
         max_age_s = self._settings.pose_max_age_s
@@ -71,7 +72,7 @@ class PoseTrack:
             return "the stage's pose after the last exposure is unknown"
         return ""
 
-    def _disagreement(self, poses: Sequence[PoseEvent]) -> str:
+    def _disagreement(self, poses: Sequence[StagePose]) -> str:
         settings = self._settings
         for pose in poses[1:]:
             if pose.frame_id != poses[0].frame_id:
@@ -91,7 +92,7 @@ class PoseTrack:
         return ""
 
 
-def _angle(a: PoseEvent, b: PoseEvent) -> float:
+def _angle(a: StagePose, b: StagePose) -> float:
     """Angle between two orientations, rad; q and -q are the same one."""
     p, q = a.quaternion_xyzw, b.quaternion_xyzw
     apart = math.dist(p, q)

@@ -10,18 +10,15 @@ from typing import Any
 import numpy as np
 
 from sl_camera.sync.match_events import (
-    PIXEL_TYPES,
     FrameDecision,
     ImageEvent,
-    MatchedStack,
     MatcherSettings,
-    Pixels,
-    PoseEvent,
     Status,
     TriggerEvent,
 )
 from sl_common.errors import SequenceError
 from sl_projector.sequence.pattern_sequence import NAMED, PatternSequence, named
+from sl_projector.sequence.stack import PIXEL_TYPES, Pixels, Stack, StagePose
 
 Allocate = Callable[[tuple[int, int, int], np.dtype[Any]], Pixels]
 
@@ -271,16 +268,15 @@ class ScanRecord:
                 f"expected at most {allowed_ns * 1e-6:.3f} ms"
             )
 
-    def stack(self, pose: PoseEvent | None) -> MatchedStack:
+    def stack(self, pose: StagePose | None) -> Stack:
         """Return the stack of a scan without problems."""
         assert self.data is not None
         order = range(self.count)
         patterns = tuple(self.triggers[i].pattern for i in order)
-        return MatchedStack(
-            self.first.scan_id,
-            PatternSequence(self.first.sequence_name, self.first.dmd_size, patterns),
+        return Stack(
             self.data,
-            tuple(self.triggers[i].stamp_ns for i in order),
+            PatternSequence(self.first.sequence_name, self.first.dmd_size, patterns),
+            self.first.scan_id,
             tuple(self.image_stamps[i] for i in order),
             self.first.exposure_s,
             pose,
@@ -303,7 +299,7 @@ class ScanRecord:
         reason: str = "",
         trigger_ns: int | None = None,
         image_ns: int = 0,
-        pose: PoseEvent | None = None,
+        pose: StagePose | None = None,
     ) -> FrameDecision:
         """Make a decision of this scan; the trigger's stamp is looked up where not given."""
         if trigger_ns is None:
