@@ -35,7 +35,7 @@ check: venv ## style, types, import directions: under a minute
 	@$(PYTEST) -q tests/common/test_architecture.py
 
 paper: venv ## the paper's Table 2 and Figs. 10 and 11 on the bench, beside the paper's numbers
-	@$(BIN)/python -m sl_bringup.results.paper --output $(OUTPUT)/paper
+	@$(BIN)/python benchmarks/paper/reproduce.py --output $(OUTPUT)/paper
 
 bench: venv ## speed and memory
 	@set -e; for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b; done

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 from matplotlib import colormaps
@@ -24,15 +23,9 @@ from sl_bringup.results.pictures import (
 from sl_bringup.results.report import micrometres
 from sl_reconstruct.cloud.cloud_writer import POINT_FIELDS
 from sl_reconstruct.cloud.height_map import HeightMap
+from support.png_files import pixels
 
 SHAPE = (120, 160)
-
-
-def pixels(png: bytes) -> np.ndarray:
-    """Decode to RGB, failing on anything but a whole PNG."""
-    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
-    assert image is not None
-    return image[..., ::-1]
 
 
 def share(image: np.ndarray, colour: str) -> float:

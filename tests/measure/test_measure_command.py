@@ -6,11 +6,10 @@ import zipfile
 
 import numpy as np
 import pytest
-from test_pictures import pixels
 
+from naive_decoding import naive
 from sl_bench.world.reference_rig import reference_rig
 from sl_bringup.cli.main import main
-from sl_bringup.results.paper import naive
 from sl_common.errors import ConfigError
 from sl_projector.sequence.pattern_sequence import named
 from sl_reconstruct.cloud.cloud import CLOUD_DTYPE
@@ -18,6 +17,7 @@ from sl_reconstruct.cloud.cloud_reader import read_cloud
 from sl_reconstruct.cloud.cloud_writer import save_pcd, save_ply
 from sl_reconstruct.cloud.height_map import make_height_map, save_tiff
 from support.measured_clouds import cloud
+from support.png_files import pixels
 
 
 @pytest.fixture

@@ -18,27 +18,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from figure_10 import groove_picture
+from naive_decoding import GRAY_BITS, naive
 from sl_bench.world.optics import Optics
 from sl_bench.world.reference_rig import reference_rig
 from sl_bench.world.surfaces import make_surface
 from sl_bench.world.world import World
 from sl_bringup.graph.console import complain, say
-from sl_bringup.results.paper_pictures import groove_picture
 from sl_bringup.results.pictures import relief_picture, section_picture
 from sl_bringup.results.report import write_json
 from sl_common.documents import written_atomically
 from sl_common.errors import SlError
 from sl_projector.sequence.pattern_sequence import PatternSequence, named
-from sl_reconstruct.cloud.cloud import CLOUD_DTYPE
 from sl_reconstruct.cloud.height_map import make_height_map
 from sl_reconstruct.measure.groove import measure_groove
 from sl_reconstruct.measure.plane_angle import AngleMeasurement, measure_angle
 from sl_reconstruct.measure.profile import ProfileMeasurement, measure_profile
 from sl_reconstruct.measure.region import Region, select
-from sl_reconstruct.model.rig import Rig
 from sl_reconstruct.reconstruction.reconstructor import Reconstructor
-
-Array = NDArray[np.float64]
 
 FRAME_S = 1.0 / 30.0
 TRUE_ANGLE_DEG = 155.92
@@ -61,9 +58,6 @@ PAPER: dict[str, Any] = {
 }
 PAPER_PLANES = ("Z = -0.2265 X +0.0016 Y", "Z = +0.2621 X +0.0013 Y")
 PAPER_COIN = {"points": 137_033, "height_um": 50.0}
-#: Gray code alone: I1-I8, 256 divisions of 4 DMD columns.
-GRAY_BITS, DIVISION_PX = 8, 4
-NEWTON_STEPS = 6
 
 
 @dataclass(frozen=True)
@@ -113,54 +107,6 @@ def scan(surface: str, name: str) -> tuple[Row, NDArray[Any]]:
     cloud = reconstructor(stack)
     taken = time.perf_counter() - start
     return Row(name, cloud.points, len(sequence) * FRAME_S + taken), stack
-
-
-def naive(rig: Rig, stack: NDArray[Any]) -> NDArray[Any]:
-    """Decode as the lower part of Fig. 10: no sub-pixel edges, no line shift.
-
-    Parameters
-    ----------
-    rig : Rig
-        Camera and projector.
-    stack : ndarray, (N, H, W)
-        Images of the sequence `paper`; only I1 to I8 are used.
-
-    Returns
-    -------
-    ndarray, (H, 255), structured
-        A point per division border and row, at the border of two pixels.
-    """
-    gray = stack[:GRAY_BITS]
-    high, low = gray.max(axis=0), gray.min(axis=0)
-    lit = high.astype(int) - low > 30
-    threshold = 0.5 * (high.astype(np.float32) + low)
-    number = np.zeros(lit.shape, dtype=np.int64)
-    bit = np.zeros(lit.shape, dtype=np.int64)
-    for image in gray:
-        bit ^= image > threshold
-        number = 2 * number + bit
-    edge = (np.abs(np.diff(number, axis=1)) == 1) & lit[:, 1:] & lit[:, :-1]
-    row, column = np.nonzero(edge)
-    border = np.maximum(number[row, column], number[row, column + 1])
-    points = np.full((len(number), 2**GRAY_BITS - 1), np.nan, dtype=CLOUD_DTYPE)
-    xyz = _meet(rig, np.stack([column + 0.5, row], axis=1), DIVISION_PX * border - 0.5)
-    for index, axis in enumerate("xyz"):
-        points[axis][row, border - 1] = xyz[:, index]
-    return points
-
-
-def _meet(rig: Rig, q_px: Array, u_px: Array) -> Array:
-    """Points (n, 3) where camera rays meet projector columns, by Newton's method along the ray."""
-    rays, origin = rig.camera.rays(q_px), rig.camera.position_m
-    depth, step = np.full(len(q_px), float(np.linalg.norm(origin))), 1e-6
-
-    def miss(t: Array) -> Array:
-        return np.asarray(rig.projector.project(origin + t[:, None] * rays)[:, 0] - u_px)
-
-    for _ in range(NEWTON_STEPS):
-        error = miss(depth)
-        depth = depth - error * step / (miss(depth + step) - error)
-    return np.asarray(origin + depth[:, None] * rays)
 
 
 def _angle(row: Row) -> AngleMeasurement:
