@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import sqlite3
 import struct
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
+from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -342,6 +344,43 @@ def test_a_topic_without_a_type_costs_only_itself(tmp_path: Path) -> None:
         (found,) = bag.messages(POSE, IMAGE)
         assert found.message.pose.position.x == 0.001
         assert bag.lost == ["a.mcap: what type /sl/camera/image_raw has cannot be read"]
+
+
+def foreign_poses(path: Path, topics: list[str]) -> None:
+    """Fifty messages of each topic, announced in turn, in one chunk without checksum."""
+    definition = typestore().generate_msgdef(POSE.msgtype)[0].encode()
+    with path.open("wb") as file:
+        writer = McapWriter(file, compression=CompressionType.NONE, enable_crcs=False)
+        writer.start(profile="ros2", library="test")
+        schema = writer.register_schema(POSE.msgtype, "ros2msg", definition)
+        for topic in topics:
+            channel = writer.register_channel(topic, "cdr", schema)
+            for i in range(50):
+                writer.add_message(channel, START_NS + i, bytes(100), START_NS)
+        writer.finish()
+
+
+def test_a_damaged_length_is_told_without_a_checksum(tmp_path: Path) -> None:
+    """The library's `breakup_chunk` takes what is left of the chunk for the message, silently."""
+    foreign_poses(tmp_path / "a.mcap", [f"/sl/{POSE.name}"])
+    content = bytearray((tmp_path / "a.mcap").read_bytes())
+    messages = [m.start() for m in re.finditer(rb"\x05\x7a" + bytes(7), content)]
+    assert len(messages) == 50
+    content[messages[20] + 3] ^= 1
+    (tmp_path / "a.mcap").write_bytes(content)
+    with open_bag(tmp_path / "a.mcap") as bag:
+        assert len(list(bag.raw(POSE))) == 20
+        assert any("reaches beyond its chunk" in line for line in bag.lost)
+
+
+def test_a_topic_announced_late_is_found_without_a_summary(tmp_path: Path) -> None:
+    topics = [f"/sl/{POSE.name}", "/sl/late"]
+    foreign_poses(tmp_path / "a.mcap", topics)
+    content = (tmp_path / "a.mcap").read_bytes()
+    (tmp_path / "a.mcap").write_bytes(content[:-20])
+    with open_bag(tmp_path / "a.mcap") as bag:
+        assert topic_names(bag) == sorted(topics)
+        assert sum(1 for _ in bag.everything()) == 100
 
 
 def test_two_rigs_need_a_name(tmp_path: Path) -> None:

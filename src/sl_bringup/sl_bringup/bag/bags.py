@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+import zstandard
 from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.rosbag2.reader import DirectoryReader
@@ -24,7 +25,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from sl_bringup.bag.mcap_reader import NO_TYPE, McapFile
-from sl_bringup.bag.mcap_records import zstd
 from sl_bringup.bag.sqlite_salvage import SalvagedFile
 from sl_common.errors import BagError
 from sl_common.topics import EVALUATED_TOPICS, IMAGE, NAMESPACE, TRIGGER, Topic
@@ -336,7 +336,7 @@ def _open_directory(bag: Bag, path: Path, stack: ExitStack) -> list[_File]:
     if held != recorded:
         tell = bag.lose if held < recorded else bag.notes.append
         tell(f"{path.name}: the files hold {held} messages, {recorded} were recorded")
-    unpack = zstd.decompress if reader.metadata.compression_mode == "message" else None
+    unpack = zstandard.decompress if reader.metadata.compression_mode == "message" else None
     digests = {c.topic: c.digest for c in reader.connections}
     return [
         _File(path.name, _fast(bag, storage, stack), digests, unpack) for storage in reader.storages

@@ -1,23 +1,34 @@
-"""Reading mcap files fast, and as far as they are whole.
+"""Reading mcap files fast, and damaged ones as far as possible.
 
-One chunk is held at a time (a few where they overlap in time), its messages are views into it. A
-file without a summary, which a killed recorder leaves, is followed record by record; chunks that
-are damaged are left out and told.
+The library `mcap` decodes records, unpacks chunks and compares their checksums. Ours is the way
+through a file: to records by their offsets, past those that nobody asked for, with every length
+checked before it is followed (``docs/decisions/0012``). One chunk is held at a time (a few where
+they overlap in time), and messages are views into it. A file without a summary, which a killed
+recorder leaves, is followed record by record; damaged chunks are left out and reported.
 """
 
 from __future__ import annotations
 
 import heapq
-import os
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
+from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
-import lz4.frame  # type: ignore[import-untyped]
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Chunk, Footer, Header, MessageIndex, Schema
+from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
+from mcap.summary import Summary
+from mcap.writer import MCAP0_MAGIC as MAGIC
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
@@ -28,34 +39,30 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import parse_qos
 
-from sl_bringup.bag.mcap_records import (
-    CHUNK_HEAD,
-    FOOTER_BODY,
-    HEAD,
-    INDEX_ENTRY,
-    MAGIC,
-    MESSAGE_HEAD,
-    Fields,
-    Op,
-    zstd,
-)
-
-#: Of a topic whose schema is not in the file.
+#: Type of a topic whose schema is not in the file.
 NO_TYPE = "__schemaless__"
 #: Messages outside of chunks are read together up to this size.
 RUN_BYTES = 1 << 21
-_TAIL_BYTES = HEAD.size + FOOTER_BODY.size + len(MAGIC)
-#: The summary's checksum and what follows it.
-_AFTER_CRC = 4 + len(MAGIC)
+#: Opcode and length of the content, before every record.
+_HEAD = struct.Struct("<BQ")
+#: Channel, sequence, log time, publish time; the payload follows.
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+#: From the start of a chunk that is not compressed to its first record.
+_CHUNK_HEAD_BYTES = _HEAD.size + 40
+#: Of the footer's fields, and of an entry of a message index.
+_FOOTER_BYTES, _INDEX_ENTRY_BYTES = 20, 16
+_NO_SCHEMA = Schema(0, b"", "", NO_TYPE)
 _FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
     "ros2idl": MessageDefinitionFormat.IDL,
     "omgidl": MessageDefinitionFormat.IDL,
     "": MessageDefinitionFormat.NONE,
 }
+#: What decoding does with damaged bytes; a damaged text is a ValueError.
+_FAULTS = (ReaderError, McapError, ValueError, struct.error, OSError)
 
 
-class Message(NamedTuple):
+class _Message(NamedTuple):
     """A message on its way out; ordered by time, then by place in the file."""
 
     log_ns: int
@@ -66,25 +73,36 @@ class Message(NamedTuple):
 
 @dataclass
 class _Chunk:
-    """Where a chunk lies; an offset without chunk stands for a run of bare messages."""
+    """Where a chunk is; with ``bare`` a run of messages outside of chunks.
+
+    ``indexes`` has the offsets of its message indexes by channel, None where they are not known.
+    """
 
     start_ns: int
     end_ns: int
     offset: int
     length: int
-    #: Offsets of the message indexes by channel; None where they are not known.
     indexes: dict[int, int] | None = None
+    packed: bool = False
     bare: bool = False
 
 
-@dataclass
-class _Contents:
-    """What is known of a file."""
+class _Section(ReadDataStream):
+    """A part of a file for the readers of `mcap`; they take less than asked for, this does not."""
 
-    schemas: dict[int, tuple[str, str, str]] = field(default_factory=dict)
-    channels: dict[int, Connection] = field(default_factory=dict)
-    chunks: list[_Chunk] = field(default_factory=list)
-    counts: dict[int, int] = field(default_factory=dict)
+    def __init__(self, file: BinaryIO, start: int, length: int) -> None:
+        super().__init__(file)
+        self._start, self._length = start, length
+        file.seek(start)
+
+    def read(self, length: int) -> bytes:
+        """Read exactly so many bytes; a damaged length is noticed before memory is taken."""
+        left = self._length - self.count
+        data = super().read(length) if length <= left else b""
+        if len(data) < length:
+            place = self._start + self.count
+            raise ReaderError(f"{length} bytes expected at byte {place}, found {left}")
+        return data
 
 
 class McapFile:
@@ -100,16 +118,19 @@ class McapFile:
     Raises
     ------
     ReaderError
-        When it is no mcap file, or nothing of it is whole.
+        When it is no mcap file, or nothing in it is readable.
     """
 
     def __init__(self, path: Path, tell: Callable[[str], None]) -> None:
         self.path = path
         self._tell = tell
-        self._known = _Contents()
-        self._checked: set[int] = set()
-        self._file = os.open(path, os.O_RDONLY)
-        self._size = os.fstat(self._file).st_size
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Connection] = {}
+        self._chunks: list[_Chunk] = []
+        self._counts: Counter[int] = Counter()
+        self._reported: set[int] = set()
+        self._file = path.open("rb")
+        self._size = path.stat().st_size
         try:
             self._open()
         except BaseException:
@@ -118,16 +139,12 @@ class McapFile:
 
     def close(self) -> None:
         """Close the file."""
-        if self._file >= 0:
-            os.close(self._file)
-            self._file = -1
+        self._file.close()
 
     @property
     def connections(self) -> list[Connection]:
         """The topics, with their message counts where the file says them."""
-        counts = self._known.counts
-        channels = self._known.channels.items()
-        return [c._replace(msgcount=counts.get(number, 0)) for number, c in channels]
+        return [c._replace(msgcount=self._counts[c.id]) for c in self._channels.values()]
 
     def messages(
         self, connections: Sequence[Connection], check: bool = True
@@ -139,73 +156,87 @@ class McapFile:
         connections : sequence of Connection
             Of this file.
         check : bool
-            Read chunks as a whole and compare their checksums. Without, single messages are
-            picked out of large chunks: quick where few are wanted.
+            Read whole chunks and compare their checksums. Without, single messages are picked out
+            of large chunks, which is quick where few are wanted.
+
+        Yields
+        ------
+        tuple of Connection, int, memoryview
+            The topic, when it was recorded (nanoseconds since the epoch), and its CDR.
         """
         wanted = {c.id: c for c in connections}
-        chunks = [c for c in self._known.chunks if c.indexes is None or wanted.keys() & c.indexes]
+        chunks = [c for c in self._chunks if c.indexes is None or wanted.keys() & c.indexes]
         for message in _merged(chunks, partial(self._read, wanted=wanted, check=check)):
             yield wanted[message.channel], message.log_ns, message.data
 
     # -- opening ------------------------------------------------------------------------------
 
     def _open(self) -> None:
-        if self._bytes(0, len(MAGIC)) != MAGIC:
-            raise ReaderError("File magic is invalid." if self._size else "The file is empty.")
+        try:
+            reader = SeekingReader(self._file, record_size_limit=self._size)
+        except (McapError, struct.error):
+            raise ReaderError(
+                "File magic is invalid." if self._size else "The file is empty."
+            ) from None
         opcode, start, length = self._record(len(MAGIC))
-        if opcode != Op.HEADER or Fields(self._bytes(start, length)).text() != "ros2":
+        if opcode != Opcode.HEADER or Header.read(self._section(start, length)).profile != "ros2":
             raise ReaderError("Profile is not ros2.")
-        if not self._read_summary():
+        if not self._read_summary(reader):
             self._scan(start + length)
 
-    def _read_summary(self) -> bool:
-        """Take topics and chunks from the end of the file; false when there is no such end."""
-        if self._size < _TAIL_BYTES:
+    def _read_summary(self, reader: SeekingReader) -> bool:
+        """Take topics and chunks from the end of the file; false when that is not possible."""
+        try:
+            summary = reader.get_summary()
+            if summary is None or not _is_complete(summary):
+                return False
+            place = self._size - len(MAGIC) - _FOOTER_BYTES
+            footer = Footer.read(self._section(place, _FOOTER_BYTES))
+            # Its last field is the checksum of all that is before it.
+            size = self._size - len(MAGIC) - 4 - footer.summary_start
+            crc = zlib.crc32(self._section(footer.summary_start, size).read(size))
+        except _FAULTS:
             return False
-        tail = self._bytes(self._size - _TAIL_BYTES, _TAIL_BYTES)
-        opcode, length = HEAD.unpack_from(tail)
-        start, _, crc = FOOTER_BODY.unpack_from(tail, HEAD.size)
-        ended = tail[-len(MAGIC) :] == MAGIC and (opcode, length) == (Op.FOOTER, FOOTER_BODY.size)
-        if not (ended and 0 < start < self._size):
-            return False
-        if crc and crc != zlib.crc32(self._bytes(start, self._size - _AFTER_CRC - start)):
+        if footer.summary_crc not in (0, crc):
             self._tell(f"{self.path.name}: the summary is damaged; read without it")
             return False
-        try:
-            for opcode, place, length in self._records(start, self._size - _TAIL_BYTES):
-                self._take(opcode, self._bytes(place, length))
-            whole = self._summary_is_whole()
-        except (ReaderError, struct.error, ValueError):
-            whole = False
-        if not whole:
-            self._known = _Contents()
-        return whole
+        self._take_summary(summary)
+        return True
 
-    def _summary_is_whole(self) -> bool:
-        """Whether the summary names everything; some writers leave channels or chunks out."""
-        return bool(self._known.channels) and bool(
-            self._known.chunks or not sum(self._known.counts.values())
-        )
+    def _take_summary(self, summary: Summary) -> None:
+        self._schemas = summary.schemas
+        for channel in summary.channels.values():
+            self._add(channel)
+        for index in summary.chunk_indexes:
+            span = index.message_start_time, index.message_end_time
+            place = index.chunk_start_offset, index.chunk_length
+            indexes = index.message_index_offsets or None
+            self._chunks.append(_Chunk(*span, *place, indexes, bool(index.compression)))
+        if summary.statistics:
+            self._counts.update(summary.statistics.channel_message_counts)
 
     def _scan(self, start: int) -> None:
-        """Follow the records one by one, as far as they are whole."""
-        end, whole, problem = start, False, ""
+        """Follow the records one by one, as far as they are readable."""
+        end, ended, problem = start, False, ""
         try:
             for opcode, place, length in self._records(start, self._size):
-                if opcode in (Op.FOOTER, Op.DATA_END):
-                    whole = True
+                if opcode in (Opcode.FOOTER, Opcode.DATA_END):
+                    ended = True
                     break
                 self._note(opcode, place, length)
                 end = place + length
-        except (ReaderError, struct.error, ValueError) as error:
+        except _FAULTS as error:
             problem = f" ({error})"
-        if not whole:
-            if self._known.chunks:  # its index may be incomplete
-                self._known.chunks[-1].indexes = None
+        if not ended:
+            if self._chunks:  # its index may be incomplete
+                self._chunks[-1].indexes = None
             self._tell(
                 f"{self.path.name}: the end is missing; {self._size - end} of {self._size} bytes "
                 f"are unreadable{problem}"
             )
+
+    def _section(self, start: int, length: int) -> _Section:
+        return _Section(self._file, start, length)
 
     def _records(self, start: int, end: int) -> Iterator[tuple[int, int, int]]:
         """Opcode, place and length of each record's content."""
@@ -215,165 +246,139 @@ class McapFile:
             start = place + length
 
     def _record(self, start: int) -> tuple[int, int, int]:
-        opcode, length = HEAD.unpack(self._bytes(start, HEAD.size))
-        place = start + HEAD.size
-        if not Op.HEADER <= opcode <= Op.DATA_END or place + length > self._size:
-            raise ReaderError(f"no whole record at byte {start}")
-        return opcode, place, length
+        if 0 <= start <= self._size - _HEAD.size:
+            opcode, length = _HEAD.unpack(self._section(start, _HEAD.size).read(_HEAD.size))
+            place = start + _HEAD.size
+            if Opcode.HEADER <= opcode <= Opcode.DATA_END and place + length <= self._size:
+                return opcode, place, length
+        raise ReaderError(f"no complete record at byte {start}")
 
     def _note(self, opcode: int, place: int, length: int) -> None:
         """Note one record of a file without summary."""
-        chunks = self._known.chunks
-        if opcode == Op.CHUNK:
-            start_ns, end_ns, _, _ = CHUNK_HEAD.unpack(self._bytes(place, CHUNK_HEAD.size))
-            chunks.append(_Chunk(start_ns, end_ns, place - HEAD.size, length + HEAD.size))
-            self._take_from_chunk(chunks[-1])
-        elif opcode == Op.MESSAGE:
-            channel, _, log_ns, _ = MESSAGE_HEAD.unpack(self._bytes(place, MESSAGE_HEAD.size))
-            self._known.counts[channel] = self._known.counts.get(channel, 0) + 1
-            self._note_bare(log_ns, place - HEAD.size, length + HEAD.size)
-        elif opcode == Op.MESSAGE_INDEX and chunks:
-            channel, bytes_ = struct.unpack("<HI", self._bytes(place, 6))
-            counts = self._known.counts
-            counts[channel] = counts.get(channel, 0) + bytes_ // INDEX_ENTRY.size
-            if chunks[-1].indexes is None:
-                chunks[-1].indexes = {}
-            chunks[-1].indexes[channel] = place - HEAD.size
-        elif opcode in (Op.SCHEMA, Op.CHANNEL):
-            self._take(opcode, self._bytes(place, length))
+        chunks, section = self._chunks, self._section(place, length)
+        if opcode == Opcode.CHUNK:
+            start_ns, end_ns = section.read8(), section.read8()
+            chunks.append(_Chunk(start_ns, end_ns, place - _HEAD.size, length + _HEAD.size))
+            with suppress(Exception):  # reported when its messages are read
+                self._take_from_chunk(chunks[-1], section)
+        elif opcode == Opcode.MESSAGE:
+            channel, _, log_ns, _ = _MESSAGE_HEAD.unpack(section.read(_MESSAGE_HEAD.size))
+            self._counts[channel] += 1
+            self._note_bare(log_ns, place - _HEAD.size, length + _HEAD.size)
+        elif opcode == Opcode.MESSAGE_INDEX and chunks:
+            channel, size = section.read2(), section.read4()
+            self._counts[channel] += size // _INDEX_ENTRY_BYTES
+            indexes = chunks[-1].indexes or {}
+            chunks[-1].indexes = {**indexes, channel: place - _HEAD.size}
+        else:
+            self._take(opcode, section)
 
     def _note_bare(self, log_ns: int, offset: int, length: int) -> None:
         """Messages outside of chunks: runs of them are read as one."""
-        last = self._known.chunks[-1] if self._known.chunks else None
+        last = self._chunks[-1] if self._chunks else None
         follows = last is not None and last.bare and last.offset + last.length == offset
         if last and follows and log_ns >= last.end_ns and last.length < RUN_BYTES:
             last.length += length
             last.end_ns = log_ns
         else:
-            self._known.chunks.append(_Chunk(log_ns, log_ns, offset, length, bare=True))
+            self._chunks.append(_Chunk(log_ns, log_ns, offset, length, bare=True))
 
-    def _take_from_chunk(self, chunk: _Chunk) -> None:
-        """Announcements within a chunk; a large first record is a message, and holds none."""
-        try:
-            records, _ = self._unpacked(chunk, check=False, announcements=True)
+    def _take_from_chunk(self, chunk: _Chunk, section: _Section) -> None:
+        """Take announcements within a chunk; ``section`` stands behind the chunk's times."""
+        section.read(12)
+        chunk.packed = bool(section.read_prefixed_string())
+        if chunk.packed:
+            records = self._unpacked(chunk, check=False)
             for opcode, start, length in _walk(records):
-                if opcode in (Op.SCHEMA, Op.CHANNEL):
-                    self._take(opcode, bytes(records[start : start + length]))
-        except Exception:  # told when its messages are read
+                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    content = BytesIO(records[start : start + length])
+                    self._take(opcode, _Section(content, 0, length))
+        else:
+            end = chunk.offset + chunk.length
+            for opcode, place, length in self._records(chunk.offset + _CHUNK_HEAD_BYTES, end):
+                self._take(opcode, self._section(place, length))
+
+    def _take(self, opcode: int, section: _Section) -> None:
+        """Take what a record announces; others hold nothing of interest here."""
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(section)
+            self._schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            self._add(Channel.read(section))
+
+    def _add(self, channel: Channel) -> None:
+        """Announce a topic; each is announced in several places."""
+        if channel.id in self._channels:
             return
-
-    def _take(self, opcode: int, content: bytes) -> None:
-        fields, known = Fields(content), self._known
-        if opcode == Op.SCHEMA:
-            (number,) = fields.unpack("H")
-            known.schemas[number] = fields.text(), fields.text(), fields.raw().decode()
-        elif opcode == Op.CHANNEL:
-            number, schema = fields.unpack("HH")
-            if number not in known.channels:
-                known.channels[number] = self._connection(number, schema, fields)
-        elif opcode == Op.CHUNK_INDEX:
-            start_ns, end_ns, offset, length = fields.unpack("QQQQ")
-            entries = struct.iter_unpack("<HQ", fields.raw())
-            known.chunks.append(_Chunk(start_ns, end_ns, offset, length, dict(entries) or None))
-        elif opcode == Op.STATISTICS:
-            fields.unpack("QHIIIIQQ")
-            known.counts = dict(struct.iter_unpack("<HQ", fields.raw()))
-
-    def _connection(self, number: int, schema: int, fields: Fields) -> Connection:
-        name, encoding, definition = self._known.schemas.get(schema, (NO_TYPE, "", ""))
-        topic, serialisation, metadata = fields.text(), fields.text(), fields.texts()
-        return Connection(
-            number,
-            topic,
-            name,
-            MessageDefinition(_FORMATS.get(encoding, MessageDefinitionFormat.NONE), definition),
-            metadata.get("topic_type_hash", ""),
+        schema = self._schemas.get(channel.schema_id, _NO_SCHEMA)
+        kind = _FORMATS.get(schema.encoding, MessageDefinitionFormat.NONE)
+        self._channels[channel.id] = Connection(
+            channel.id,
+            channel.topic,
+            schema.name,
+            MessageDefinition(kind, schema.data.decode()),
+            channel.metadata.get("topic_type_hash", ""),
             0,
-            ConnectionExtRosbag2(serialisation, offered_qos(metadata)),
+            ConnectionExtRosbag2(channel.message_encoding, offered_qos(channel.metadata)),
             self,
         )
 
     # -- reading ------------------------------------------------------------------------------
 
-    def _bytes(self, start: int, length: int) -> bytes:
-        data = os.pread(self._file, length, start)
-        while len(data) < length:  # a single call gives 2 GiB at most
-            more = os.pread(self._file, length - len(data), start + len(data))
-            if not more:
-                raise ReaderError(f"{length} bytes expected at byte {start}, found {len(data)}")
-            data += more
-        return data
-
-    def _read(self, chunk: _Chunk, wanted: Mapping[int, Connection], check: bool) -> list[Message]:
-        """Read the messages of a chunk in order of time; of a damaged one those that are whole."""
-        found: list[Message] = []
+    def _read(self, chunk: _Chunk, wanted: Mapping[int, Connection], check: bool) -> list[_Message]:
+        """Read the messages of a chunk in order of time; of a damaged one what is readable."""
+        found: list[_Message] = []
         try:
-            if not check and chunk.indexes and not chunk.bare:
-                return self._picked(chunk, wanted)
-            records, fault = self._unpacked(chunk, check)
-            if fault:
-                self._lost(chunk, fault)
-                return []
+            if chunk.indexes and not (check or chunk.packed):
+                return sorted(self._picked(chunk, wanted))
+            # What is unpacked as a whole costs little to be checked.
+            records = self._unpacked(chunk, check or chunk.packed)
             for opcode, start, length in _walk(records):
-                if opcode == Op.MESSAGE:
-                    channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(records, start)
+                if opcode == Opcode.MESSAGE:
+                    channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(records, start)
                     if channel in wanted:
-                        data = records[start + MESSAGE_HEAD.size : start + length]
-                        found.append(Message(log_ns, (chunk.offset, start), channel, data))
+                        data = records[start + _MESSAGE_HEAD.size : start + length]
+                        found.append(_Message(log_ns, (chunk.offset, start), channel, data))
         except Exception as error:  # a damaged file makes decoders fail in any way they can
             self._lost(chunk, str(error))
         return sorted(found)
 
     def _lost(self, chunk: _Chunk, why: str) -> None:
-        if chunk.offset not in self._checked:
-            self._checked.add(chunk.offset)
+        if chunk.offset not in self._reported:
+            self._reported.add(chunk.offset)
             self._tell(f"{self.path.name}: {chunk.length} bytes at byte {chunk.offset}: {why}")
 
-    def _unpacked(
-        self, chunk: _Chunk, check: bool, announcements: bool = False
-    ) -> tuple[memoryview, str]:
-        """Records of a chunk, and what is wrong with them."""
+    def _unpacked(self, chunk: _Chunk, check: bool) -> memoryview:
+        """Records of a chunk, or a run of messages outside of chunks."""
         if chunk.bare:
-            return memoryview(self._bytes(chunk.offset, chunk.length)), ""
-        place = chunk.offset + HEAD.size
-        head = self._bytes(place, min(256, chunk.length - HEAD.size))
-        _, _, size, crc = CHUNK_HEAD.unpack_from(head)
-        fields = Fields(head[CHUNK_HEAD.size :])
-        compression = fields.text()
-        (stored,) = fields.unpack("Q")
-        place += len(head) - fields.left
-        if place + stored > chunk.offset + chunk.length:
-            raise ReaderError("its records reach beyond its end")
-        if (
-            announcements
-            and not compression
-            and HEAD.unpack(self._bytes(place, 9))[0] == Op.MESSAGE
-        ):
-            return memoryview(b""), ""
-        packed = self._bytes(place, stored)
-        records = memoryview(_DECOMPRESSORS[compression](packed))
-        if len(records) != size:
-            return records, f"{len(records)} bytes in a chunk of {size}"
-        wrong = check and crc and zlib.crc32(records) != crc
-        return records, "its checksum is wrong" if wrong else ""
+            return memoryview(self._section(chunk.offset, chunk.length).read(chunk.length))
+        content = chunk.offset + _HEAD.size, chunk.length - _HEAD.size
+        record = Chunk.read(self._section(*content))
+        try:
+            stream, size = get_chunk_data_stream(record, validate_crc=check)
+        except CRCValidationError:
+            raise ReaderError("its checksum is wrong") from None
+        if size != record.uncompressed_size:
+            raise ReaderError(f"{size} bytes in a chunk of {record.uncompressed_size}")
+        return memoryview(stream.read(size))  # all at once is not copied
 
-    def _picked(self, chunk: _Chunk, wanted: Mapping[int, Connection]) -> list[Message]:
-        """Pick single messages out of a chunk by its index, unless it is compressed."""
-        place = chunk.offset + HEAD.size
-        head = self._bytes(place, min(256, chunk.length - HEAD.size))
-        fields = Fields(head[CHUNK_HEAD.size :])
-        if fields.text():  # the whole chunk is unpacked anyway, so its checksum costs little
-            return self._read(_without_index(chunk), wanted, check=True)
-        fields.unpack("Q")
-        place += len(head) - fields.left
-        found = []
-        for channel in wanted.keys() & (chunk.indexes or {}).keys():
-            _, start, length = self._record((chunk.indexes or {})[channel])
-            for log_ns, offset in INDEX_ENTRY.iter_unpack(self._bytes(start + 6, length - 6)):
-                _, at, size = self._record(place + offset)
-                data = memoryview(self._bytes(at, size))[MESSAGE_HEAD.size :]
-                found.append(Message(log_ns, (chunk.offset, offset), channel, data))
-        return sorted(found)
+    def _picked(self, chunk: _Chunk, wanted: Mapping[int, Connection]) -> Iterator[_Message]:
+        """Pick single messages out of a chunk that is not compressed, by its indexes."""
+        indexes = chunk.indexes or {}
+        for channel in wanted.keys() & indexes.keys():
+            _, place, length = self._record(indexes[channel])
+            for log_ns, offset in MessageIndex.read(self._section(place, length)).records:
+                _, start, size = self._record(chunk.offset + _CHUNK_HEAD_BYTES + offset)
+                data = memoryview(self._section(start, size).read(size))[_MESSAGE_HEAD.size :]
+                yield _Message(log_ns, (chunk.offset, offset), channel, data)
+
+
+def _is_complete(summary: Summary) -> bool:
+    """Whether a summary names everything; some writers leave channels or chunks out."""
+    told, channels, chunks = summary.statistics, summary.channels, summary.chunk_indexes
+    if told is None or len(channels) < told.channel_count or len(chunks) < told.chunk_count:
+        return False
+    return bool(chunks or not told.message_count)  # else the messages are outside of chunks
 
 
 def offered_qos(metadata: Mapping[str, str]) -> list[Qos]:
@@ -384,33 +389,24 @@ def offered_qos(metadata: Mapping[str, str]) -> list[Qos]:
         return []
 
 
-_DECOMPRESSORS: dict[str, Callable[[bytes], bytes]] = {
-    "": lambda packed: packed,
-    "lz4": lz4.frame.decompress,
-    "zstd": zstd.decompress,
-}
-
-
-def _without_index(chunk: _Chunk) -> _Chunk:
-    return _Chunk(chunk.start_ns, chunk.end_ns, chunk.offset, chunk.length)
-
-
 def _walk(records: memoryview) -> Iterator[tuple[int, int, int]]:
     """Opcode, start and length of the content of each record of a chunk."""
     at = 0
     while at < len(records):
-        opcode, length = HEAD.unpack_from(records, at)
-        at += HEAD.size
+        opcode, length = _HEAD.unpack_from(records, at)
+        at += _HEAD.size
         if at + length > len(records):
             raise ReaderError(f"a record of {length} bytes reaches beyond its chunk")
         yield opcode, at, length
         at += length
 
 
-def _merged(chunks: Sequence[_Chunk], read: Callable[[_Chunk], list[Message]]) -> Iterator[Message]:
+def _merged(
+    chunks: Sequence[_Chunk], read: Callable[[_Chunk], list[_Message]]
+) -> Iterator[_Message]:
     """Messages of all chunks in order of time; a chunk is read when its time comes."""
     waiting = sorted(chunks, key=lambda c: (c.start_ns, c.offset), reverse=True)
-    heap: list[tuple[Message, Iterator[Message]]] = []
+    heap: list[tuple[_Message, Iterator[_Message]]] = []
     while waiting or heap:
         while waiting and (not heap or waiting[-1].start_ns <= heap[0][0].log_ns):
             rest = iter(read(waiting.pop()))

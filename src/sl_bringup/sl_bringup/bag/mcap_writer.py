@@ -2,7 +2,8 @@
 
 Messages are gathered in chunks that are handed to the operating system when they are full or half
 a second old. A large message is a chunk of its own: the small ones are then found without reading
-the images, and an image is never compressed for nothing.
+the images, and an image is never compressed for nothing. Records are encoded by the library `mcap`;
+its own writer has neither of these (``docs/decisions/0012``).
 """
 
 from __future__ import annotations
@@ -10,52 +11,54 @@ from __future__ import annotations
 import struct
 import time
 import zlib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from pathlib import Path
-from typing import BinaryIO
 
-from sl_bringup.bag.mcap_records import (
-    CHUNK_HEAD,
-    FOOTER_BODY,
-    HEAD,
-    INDEX_ENTRY,
-    MAGIC,
-    MESSAGE_HEAD,
-    Op,
-    record,
-    text,
-    texts,
-    zstd,
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Message,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
 )
+from mcap.writer import MCAP0_MAGIC as MAGIC
 
 #: A message from this size on is a chunk of its own.
 LARGE_BYTES = 1 << 16
 #: A chunk of small messages is full at this size, and written at this age.
 CHUNK_BYTES, CHUNK_AGE_S = 1 << 18, 0.5
+_NAME = "slrig"
 
 
 class _Chunk:
     """Messages that wait to be written together."""
 
     def __init__(self) -> None:
-        self.parts: list[bytes | memoryview] = []
-        self.bytes = 0
-        self.crc = 0
-        self.times: list[int] = []
+        self.records = RecordBuilder()
         self.index: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
         self.began_s = time.monotonic()
 
-    def add(self, channel: int, number: int, log_ns: int, publish_ns: int, data: bytes) -> None:
-        head = HEAD.pack(Op.MESSAGE, MESSAGE_HEAD.size + len(data)) + MESSAGE_HEAD.pack(
-            channel, number, log_ns, publish_ns
-        )
-        self.index[channel].append((log_ns, self.bytes))
-        self.times.append(log_ns)
-        for part in (head, data):
-            self.parts.append(part)
-            self.bytes += len(part)
-            self.crc = zlib.crc32(part, self.crc)
+    def add(self, message: Message) -> None:
+        self.index[message.channel_id].append((message.log_time, self.records.count))
+        message.write(self.records)
+
+    @property
+    def span(self) -> tuple[int, int]:
+        times = [log_ns for entries in self.index.values() for log_ns, _ in entries]
+        return min(times), max(times)
 
 
 class McapWriter:
@@ -73,28 +76,30 @@ class McapWriter:
 
     def __init__(self, path: Path, compress: bool, metadata: Mapping[str, str]) -> None:
         self.path = path
-        self._file: BinaryIO = path.open("xb")
+        self._file = path.open("xb")
         self._compress = compress
         self._chunk = _Chunk()
-        self._schemas: list[bytes] = []
-        self._channels: list[bytes] = []
-        self._chunks: list[bytes] = []
-        self.counts: dict[int, int] = {}
+        self._schemas: list[Schema] = []
+        self._channels: list[Channel] = []
+        self._chunks: list[ChunkIndex] = []
+        self.counts: Counter[int] = Counter()
         self.start_ns, self.end_ns = 0, 0
-        self._file.write(MAGIC + record(Op.HEADER, text("ros2"), text("slrig")))
-        self._metadata = self._file.tell(), record(Op.METADATA, text("slrig"), texts(metadata))
-        self._file.write(self._metadata[1])
+        self._file.write(MAGIC)
+        self._put(Header("ros2", _NAME))
+        start = self._file.tell()
+        self._put(Metadata(_NAME, dict(metadata)))
+        self._metadata = MetadataIndex(start, self._file.tell() - start, _NAME)
         self._file.flush()
 
     @property
     def size(self) -> int:
         """Bytes written so far."""
-        return self._file.tell() + self._chunk.bytes
+        return self._file.tell() + self._chunk.records.count
 
     @property
     def message_count(self) -> int:
         """Messages so far."""
-        return sum(self.counts.values())
+        return self.counts.total()
 
     def add_channel(self, topic: str, msgtype: str, definition: str, digest: str, qos: str) -> int:
         """Announce a topic, return the number of its channel.
@@ -111,96 +116,114 @@ class McapWriter:
             YAML list of the profiles that the publishers offer.
         """
         number = len(self._channels) + 1
-        kept = {"offered_qos_profiles": qos, "topic_type_hash": digest}
-        ids = struct.pack("<H", number)
-        self._schemas.append(
-            record(Op.SCHEMA, ids, text(msgtype), text("ros2msg"), text(definition))
-        )
-        self._channels.append(record(Op.CHANNEL, ids, ids, text(topic), text("cdr"), texts(kept)))
-        self._file.write(self._schemas[-1] + self._channels[-1])
+        metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest}
+        self._schemas.append(Schema(number, definition.encode(), "ros2msg", msgtype))
+        self._channels.append(Channel(number, topic, "cdr", metadata, number))
+        self._put(self._schemas[-1], self._channels[-1])
         self.counts[number] = 0
         return number
 
     def write(self, channel: int, log_ns: int, publish_ns: int, data: bytes) -> None:
-        """Write one message, as it came over the wire."""
+        """Write one message.
+
+        Parameters
+        ----------
+        channel : int
+            From `add_channel`.
+        log_ns, publish_ns : int
+            When it was received and sent, nanoseconds since the epoch.
+        data : bytes
+            CDR, with its header.
+        """
         large = len(data) >= LARGE_BYTES
         if large:
             self._close_chunk()
         self.start_ns = log_ns if not self.message_count else min(log_ns, self.start_ns)
         self.end_ns = max(log_ns, self.end_ns)
-        self._chunk.add(channel, self.counts[channel], log_ns, publish_ns, data)
+        self._chunk.add(Message(channel, log_ns, data, publish_ns, self.counts[channel]))
         self.counts[channel] += 1
-        if large or self._chunk.bytes >= CHUNK_BYTES:
-            self._close_chunk(squeeze=not large or self._compress)
+        if large or self._chunk.records.count >= CHUNK_BYTES:
+            self._close_chunk(compress=not large or self._compress)
 
     def tick(self) -> None:
         """Hand over what has waited too long; call it several times a second."""
-        if self._chunk.bytes and time.monotonic() - self._chunk.began_s >= CHUNK_AGE_S:
+        if self._chunk.index and time.monotonic() - self._chunk.began_s >= CHUNK_AGE_S:
             self._close_chunk()
-
-    def _close_chunk(self, squeeze: bool = True) -> None:
-        chunk, self._chunk = self._chunk, _Chunk()
-        if not chunk.bytes:
-            return
-        start = self._file.tell()
-        span = min(chunk.times), max(chunk.times)
-        packed = zstd.compress(b"".join(chunk.parts), level=1) if squeeze else b""
-        squeezed = bool(packed) and len(packed) < chunk.bytes
-        parts = [packed] if squeezed else chunk.parts
-        stored = len(packed) if squeezed else chunk.bytes
-        kind = text("zstd" if squeezed else "")
-        head = CHUNK_HEAD.pack(*span, chunk.bytes, chunk.crc) + kind + struct.pack("<Q", stored)
-        self._file.write(HEAD.pack(Op.CHUNK, len(head) + stored) + head)
-        self._file.writelines(parts)
-        self._index_chunk(chunk, start, span, kind + struct.pack("<QQ", stored, chunk.bytes))
-        self._file.flush()
-
-    def _index_chunk(self, chunk: _Chunk, start: int, span: tuple[int, int], sizes: bytes) -> None:
-        """Write the chunk's message index, and keep its entry of the summary."""
-        end = self._file.tell()
-        offsets = b""
-        for channel, entries in chunk.index.items():
-            offsets += struct.pack("<HQ", channel, self._file.tell())
-            packed = b"".join(INDEX_ENTRY.pack(*entry) for entry in entries)
-            self._file.write(
-                record(Op.MESSAGE_INDEX, struct.pack("<HI", channel, len(packed)), packed)
-            )
-        place = struct.pack("<QQQQ", *span, start, end - start)
-        lengths = struct.pack("<I", len(offsets)), struct.pack("<Q", self._file.tell() - end)
-        self._chunks.append(record(Op.CHUNK_INDEX, place, lengths[0], offsets, lengths[1], sizes))
 
     def close(self) -> None:
         """Write the summary and close the file."""
         self._close_chunk()
-        self._file.write(record(Op.DATA_END, struct.pack("<I", 0)))
-        summary, crc = self._file.tell(), 0
-        offsets = b""
-        for opcode, records in (
-            (Op.SCHEMA, self._schemas), (Op.CHANNEL, self._channels),
-            (Op.STATISTICS, [self._statistics()]), (Op.CHUNK_INDEX, self._chunks),
-            (Op.METADATA_INDEX, [self._metadata_index()]),
-        ):  # fmt: skip
-            start = self._file.tell()
-            self._file.writelines(records)
-            crc = zlib.crc32(b"".join(records), crc)
-            if records:
-                place = struct.pack("<BQQ", opcode, start, self._file.tell() - start)
-                offsets += record(Op.SUMMARY_OFFSET, place)
-        offsets_start = self._file.tell()
-        footer = HEAD.pack(Op.FOOTER, FOOTER_BODY.size) + struct.pack("<QQ", summary, offsets_start)
-        crc = zlib.crc32(footer, zlib.crc32(offsets, crc))
-        self._file.write(offsets + footer + struct.pack("<I", crc) + MAGIC)
+        self._put(DataEnd(0))
+        self._file.write(self._summary(self._file.tell()) + MAGIC)
         self._file.close()
 
-    def _statistics(self) -> bytes:
-        counts = b"".join(struct.pack("<HQ", *item) for item in self.counts.items())
-        return record(
-            Op.STATISTICS,
-            struct.pack("<QHIIII", self.message_count, len(self._schemas), len(self._channels),
-                        0, 1, len(self._chunks)),
-            struct.pack("<QQI", self.start_ns, self.end_ns, len(counts)), counts,
-        )  # fmt: skip
+    def _put(self, *records: McapRecord) -> None:
+        builder = RecordBuilder()
+        for record in records:
+            record.write(builder)
+        self._file.write(builder.end())
 
-    def _metadata_index(self) -> bytes:
-        offset, written = self._metadata
-        return record(Op.METADATA_INDEX, struct.pack("<QQ", offset, len(written)), text("slrig"))
+    def _close_chunk(self, compress: bool = True) -> None:
+        chunk, self._chunk = self._chunk, _Chunk()
+        if not chunk.index:
+            return
+        plain = chunk.records.end()
+        packed = zstandard.compress(plain, 1) if compress else plain
+        kind, data = ("zstd", packed) if len(packed) < len(plain) else ("", plain)
+        start, (start_ns, end_ns) = self._file.tell(), chunk.span
+        self._put(Chunk(kind, data, end_ns, start_ns, zlib.crc32(plain), len(plain)))
+        end, offsets = self._file.tell(), {}
+        for channel, entries in chunk.index.items():
+            offsets[channel] = self._file.tell()
+            self._put(MessageIndex(channel, entries))
+        self._file.flush()
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=end - start,
+                chunk_start_offset=start,
+                compression=kind,
+                compressed_size=len(data),
+                message_end_time=end_ns,
+                message_index_length=self._file.tell() - end,
+                message_index_offsets=offsets,
+                message_start_time=start_ns,
+                uncompressed_size=len(plain),
+            )
+        )
+
+    def _summary(self, start: int) -> bytes:
+        """Everything between the end of the data and the last magic."""
+        groups: dict[Opcode, list[McapRecord]] = {
+            Opcode.SCHEMA: [*self._schemas],
+            Opcode.CHANNEL: [*self._channels],
+            Opcode.STATISTICS: [self._statistics()],
+            Opcode.CHUNK_INDEX: [*self._chunks],
+            Opcode.METADATA_INDEX: [self._metadata],
+        }
+        builder, offsets = RecordBuilder(), []
+        for opcode, records in groups.items():
+            at = builder.count
+            for record in records:
+                record.write(builder)
+            if records:
+                offsets.append(SummaryOffset(opcode, start + at, builder.count - at))
+        offsets_start = start + builder.count
+        for offset in offsets:
+            offset.write(builder)
+        Footer(start, offsets_start, 0).write(builder)
+        # The checksum is the footer's last field and covers all that is before it.
+        covered: bytes = builder.end()[:-4]
+        return covered + struct.pack("<I", zlib.crc32(covered))
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=0,
+            channel_count=len(self._channels),
+            channel_message_counts=self.counts,
+            chunk_count=len(self._chunks),
+            message_count=self.message_count,
+            message_end_time=self.end_ns,
+            message_start_time=self.start_ns,
+            metadata_count=1,
+            schema_count=len(self._schemas),
+        )
