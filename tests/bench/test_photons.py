@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm, poisson
 
-from sl_bench.world.photons import digitise, frame_key
+from sl_bench.world.photons import Sensor, digitise, frame_key
 
 SHAPE = (400, 1001)  # an odd width: the last pixel of a row has no partner
 PIXELS = SHAPE[0] * SHAPE[1]
@@ -17,7 +17,7 @@ def key(seed: int = 0, frame: int = 0) -> np.uint64:
 def read(mean_e, sensor, k=None, dtype=np.uint16):
     electrons = np.full(SHAPE, mean_e, dtype=np.float32)
     out = np.empty(SHAPE, dtype=dtype)
-    digitise(electrons, (0, SHAPE[0]), sensor, key() if k is None else k, out)
+    digitise(electrons, (0, SHAPE[0]), Sensor(*sensor), key() if k is None else k, out)
     return out.astype(np.float64)
 
 
@@ -64,7 +64,7 @@ def test_numbers_depend_on_seed_and_frame_and_pixel_only():
     electrons = np.full(SHAPE, 1000.0, dtype=np.float32)
     parts = np.empty(SHAPE, dtype=np.uint16)
     for rows in ((250, 400), (0, 99), (99, 250)):
-        digitise(electrons, rows, sensor, key(), parts)
+        digitise(electrons, rows, Sensor(*sensor), key(), parts)
     assert np.array_equal(whole, parts)
     assert not np.array_equal(whole, read(1000.0, sensor, key(seed=1)))
     assert not np.array_equal(whole, read(1000.0, sensor, key(frame=1)))

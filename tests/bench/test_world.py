@@ -65,7 +65,9 @@ def test_uneven_light_and_vignetting_take_their_share_at_the_corner():
         even.electrons_per_second(WHITE)[600], 1
     )
     u = np.array([200, 800, 1300])
-    uv = full.projector_px(full.truth_points(np.stack([u, np.full(3, 600)], axis=1).astype(float)))
+    uv = full.rig.projector.project(
+        full.truth_points(np.stack([u, np.full(3, 600)], axis=1).astype(float))
+    )
     r2 = np.sum((uv - [511.5, 383.5]) ** 2, axis=1) / (512**2 + 384**2)
     s2 = ((u - 799.5) ** 2 + 0.25) / (800**2 + 600**2)
     assert ratio[u] == pytest.approx((1 - 0.2 * r2) * (1 - 0.1 * s2), rel=1e-4)
@@ -196,10 +198,12 @@ def test_rendered_edges_are_where_the_truth_is_and_as_wide_as_stated(name, patte
 def test_edge_blur_on_the_flat_plate_is_the_sum_of_its_parts(flat):
     q = np.array([[200.0, 100.0]])
     u, u1 = (
-        flat.projector_px(flat.truth_points(q + np.array([s, 0.0])))[0, 0] for s in (-0.5, 0.5)
+        flat.rig.projector.project(flat.truth_points(q + np.array([s, 0.0])))[0, 0]
+        for s in (-0.5, 0.5)
     )
     w, w1 = (
-        flat.projector_px(flat.truth_points(q + np.array([0.0, s])))[0, 0] for s in (-0.5, 0.5)
+        flat.rig.projector.project(flat.truth_points(q + np.array([0.0, s])))[0, 0]
+        for s in (-0.5, 0.5)
     )
     along, across = u1 - u, w1 - w
     steep = np.hypot(along, across)
@@ -232,9 +236,9 @@ def test_any_mirror_image_takes_the_general_path_to_the_same_light(flat):
     for pattern in (FINE, FINE.inverse(), FINE_ROWS, FINE_ROWS.inverse()):
         mirrors = pattern.frame(DMD)
         expected = flat.electrons_per_second(mirrors)
-        u, v = np.rint(flat.projector_px(flat.truth_points(np.array([[350.0, 40.0]])))[0]).astype(
-            int
-        )
+        u, v = np.rint(
+            flat.rig.projector.project(flat.truth_points(np.array([[350.0, 40.0]])))[0]
+        ).astype(int)
         mirrors[v, u] ^= 255
         found = flat.electrons_per_second(mirrors)
         off = np.abs(found - expected) / expected.max()
@@ -245,12 +249,14 @@ def test_any_mirror_image_takes_the_general_path_to_the_same_light(flat):
 
 def test_one_mirror_sends_its_share_of_white(flat):
     mirrors = np.zeros((768, 1024), dtype=np.uint8)
-    u, v = np.rint(flat.projector_px(flat.truth_points(np.array([[200.0, 100.0]])))[0]).astype(int)
+    u, v = np.rint(
+        flat.rig.projector.project(flat.truth_points(np.array([[200.0, 100.0]])))[0]
+    ).astype(int)
     mirrors[v, u] = 1
     spot = to_dn(flat.electrons_per_second(mirrors))
     q = np.array([[200.0, 100.0]])
     step = 0.5 * np.eye(2)
-    ahead, behind = (flat.projector_px(flat.truth_points(q + s * step)) for s in (1, -1))
+    ahead, behind = (flat.rig.projector.project(flat.truth_points(q + s * step)) for s in (1, -1))
     area = 1.0 / abs(np.linalg.det(ahead - behind))  # camera pixels of one mirror
     white = to_dn(flat.electrons_per_second(WHITE))[100, 200]
     assert spot.sum() == pytest.approx(white * area, rel=1e-3)

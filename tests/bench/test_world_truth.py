@@ -86,7 +86,7 @@ def test_edges_along_rows_and_columns_are_where_the_rig_says():
     assert world.rig.projector.project(seen)[:, 0] == pytest.approx(k - 0.5, abs=1e-6)
     v = world.truth_edges(np.array([100, 400]), 700.5, axis="row")
     seen = world.truth_points(np.stack([np.full(2, 700.5), v], axis=1))
-    assert world.projector_px(seen)[:, 1] == pytest.approx([99.5, 399.5], abs=1e-6)
+    assert world.rig.projector.project(seen)[:, 1] == pytest.approx([99.5, 399.5], abs=1e-6)
 
 
 def test_edges_out_of_view_or_inside_a_jump_are_nan():

@@ -7,13 +7,15 @@ and number of threads that make it.
 from __future__ import annotations
 
 from statistics import NormalDist
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-from numba import uint32, uint64
 from numpy.typing import NDArray
 
 from sl_common.kernel_cache import kernel
+
+Image = NDArray[np.float32]
+Digital = NDArray[np.uint8] | NDArray[np.uint16]
 
 #: Above this mean, a Poisson number is taken as a Gaussian of the same mean and variance.
 GAUSSIAN_FROM_E = 30.0
@@ -41,23 +43,39 @@ _NORMAL = _normal_table()
 _FIRST_ENTRY = int(np.float32(1.0).view(np.int32)) >> _BETWEEN_BITS
 
 
+class Sensor(NamedTuple):
+    """Gain, read noise and top of the scale of the sensor."""
+
+    dn_per_e: float
+    read_noise_e: float
+    max_dn: float
+
+
 @kernel()
-def mix(x: Any) -> Any:
+def mix(x: np.uint64) -> np.uint64:
     """Hash a 64-bit number (splitmix64's finaliser: Steele, Lea and Flood, 2014)."""
-    x = uint64(x)
-    x = (x ^ (x >> uint64(30))) * uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> uint64(27))) * uint64(0x94D049BB133111EB)
-    return x ^ (x >> uint64(31))
+    x = np.uint64(x)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return np.uint64(x ^ (x >> np.uint64(31)))
 
 
 @kernel()
-def frame_key(seed: int, frame_number: int) -> Any:
-    """Start of a frame's random numbers."""
-    return mix(mix(uint64(seed) + uint64(_GOLDEN)) + uint64(frame_number) * uint64(_GOLDEN))
+def frame_key(seed: np.uint64, frame_number: np.uint64) -> np.uint64:
+    """Start of a frame's random numbers.
+
+    Parameters
+    ----------
+    seed, frame_number : uint64
+        Equal numbers give equal frames.
+    """
+    return mix(
+        mix(np.uint64(seed) + np.uint64(_GOLDEN)) + np.uint64(frame_number) * np.uint64(_GOLDEN)
+    )
 
 
 @kernel()
-def _poisson(mean: float, uniform: float) -> Any:
+def _poisson(mean: float, uniform: float) -> float:
     """Poisson number by inversion, for small means."""
     term = np.exp(-mean)
     total, count = term, 0
@@ -69,30 +87,30 @@ def _poisson(mean: float, uniform: float) -> Any:
 
 
 @kernel()
-def _normal(bits: Any) -> Any:
+def _normal(bits: np.uint32) -> np.float32:
     """Normal number of 32 random bits, by inversion: a sign, and the share of its tail."""
-    share = np.float32(np.int32(bits >> uint32(1))) + np.float32(1.0)
+    share = np.float32(np.int32(bits >> np.uint32(1))) + np.float32(1.0)
     place = np.float32(share).view(np.int32)
     entry = (place >> _BETWEEN_BITS) - _FIRST_ENTRY
     between = np.float32(place & ((1 << _BETWEEN_BITS) - 1)) * np.float32(2.0**-_BETWEEN_BITS)
     z = _NORMAL[entry] + between * (_NORMAL[entry + 1] - _NORMAL[entry])
-    return -z if bits & uint32(1) else z
+    return np.float32(-z if bits & np.uint32(1) else z)
 
 
 @kernel()
-def _normals(key: Any, first: Any, z: Any) -> None:
+def _normals(key: np.uint64, first: int, z: Image) -> None:
     """Fill an even number of normal numbers; each pair is that of its counter."""
     for pair in range(z.size // 2):
-        bits = mix(key + uint64(first + pair) * uint64(_GOLDEN))
-        z[2 * pair] = _normal(uint32(bits))
-        z[2 * pair + 1] = _normal(uint32(bits >> uint64(32)))
+        bits = mix(key + np.uint64(first + pair) * np.uint64(_GOLDEN))
+        z[2 * pair] = _normal(np.uint32(bits))
+        z[2 * pair + 1] = _normal(np.uint32(bits >> np.uint64(32)))
 
 
 @kernel()
-def _read_out(mean_e: Any, z: Any, sensor: Any, out: Any) -> bool:
+def _read_out(mean_e: Image, z: Image, sensor: Sensor, out: Digital) -> bool:
     """Write a row of DN; whether some mean is too small to be taken as a Gaussian."""
-    dn_per_e, top = np.float32(sensor[0]), np.float32(sensor[2])
-    read_e2 = np.float32(sensor[1] * sensor[1])
+    dn_per_e, top = np.float32(sensor.dn_per_e), np.float32(sensor.max_dn)
+    read_e2 = np.float32(sensor.read_noise_e * sensor.read_noise_e)
     lowest = np.float32(np.inf)
     for x in range(out.size):
         e = max(mean_e[x], np.float32(0.0))
@@ -103,19 +121,23 @@ def _read_out(mean_e: Any, z: Any, sensor: Any, out: Any) -> bool:
 
 
 @kernel()
-def _count_few(mean_e: Any, z: Any, sensor: Any, key: Any, first: Any, out: Any) -> None:
+def _count_few(
+    mean_e: Image, z: Image, sensor: Sensor, key: np.uint64, first: int, out: Digital
+) -> None:
     """Write the DN of a row's small means: a Poisson number plus Gaussian read noise."""
     dn_per_e, read_e, top = sensor
     for x in range(out.size):
         if mean_e[x] < GAUSSIAN_FROM_E:
-            bits = mix(~(key + uint64(first + x) * uint64(_GOLDEN)))
-            uniform = ((bits >> uint64(32)) + 0.5) * _TO_UNIT
+            bits = mix(~(key + np.uint64(first + x) * np.uint64(_GOLDEN)))
+            uniform = ((bits >> np.uint64(32)) + 0.5) * _TO_UNIT
             e = _poisson(max(mean_e[x], 0.0), uniform) + read_e * z[x]
             out[x] = min(max(np.rint(e * dn_per_e), 0.0), top)
 
 
 @kernel()
-def digitise(electrons: Any, rows: Any, sensor: Any, key: Any, out: Any) -> None:
+def digitise(
+    electrons: Image, rows: tuple[int, int], sensor: Sensor, key: np.uint64, out: Digital
+) -> None:
     """Write some rows of the DN image of the mean electrons, rounded and clipped.
 
     Parameters
@@ -124,8 +146,8 @@ def digitise(electrons: Any, rows: Any, sensor: Any, key: Any, out: Any) -> None
         Mean number of electrons at the end of the exposure.
     rows : tuple of int
         First row and the one behind the last.
-    sensor : tuple of float
-        Gain in DN per electron, read noise in electrons, top of the scale in DN.
+    sensor : Sensor
+        Its numbers.
     key : uint64
         From `frame_key`.
     out : ndarray, (H, W) uint8 or uint16

@@ -7,8 +7,8 @@ The device kernels write Eqs. (1) and (2) of Tsai & Hung (2005) a second time, a
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numba import carray, njit, types
@@ -20,14 +20,14 @@ from sl_common.kernel_cache import kernel
 from sl_reconstruct.model.rig import Device, Division
 
 Array = NDArray[np.float64]
+Numbers = tuple[float, ...]
+Vector = tuple[float, float, float]
+_FunctionT = TypeVar("_FunctionT", bound=Callable[..., Any])
 
 #: Kinds of surface that the kernels tell apart.
 PROFILE, SPHERE, HOLES, GRID = 0, 1, 2, 3
-
+#: Kinds of lens.
 DIVISION, BROWN_CONRADY = 0, 1
-
-
-Numbers = tuple[float, ...]
 
 
 class SurfaceData(NamedTuple):
@@ -56,13 +56,29 @@ class DeviceData(NamedTuple):
     lens: int
     coefficients: Numbers
     rotation: tuple[Numbers, Numbers, Numbers]
-    translation_m: Numbers
-    position_m: Numbers
+    translation_m: Vector
+    position_m: Vector
     size_px: Numbers
 
 
+class View(NamedTuple):
+    """A part and the devices that look at it."""
+
+    surface: SurfaceData
+    camera: DeviceData
+    projector: DeviceData
+
+
 def device_data(device: Device, rotation: Array, translation_m: Array) -> DeviceData:
-    """Pack a device for the kernels; the pose is world_from_part."""
+    """Pack a device for the kernels.
+
+    Parameters
+    ----------
+    device : Device
+        Camera or projector.
+    rotation, translation_m : ndarray, (3, 3), (3,)
+        world_from_part.
+    """
     if isinstance(device.lens, Division):
         lens, coefficients = DIVISION, [device.lens.kappa, 0.0, 0.0, 0.0, 0.0]
     else:
@@ -70,10 +86,15 @@ def device_data(device: Device, rotation: Array, translation_m: Array) -> Device
     turn = device.rotation @ rotation
     shift = device.rotation @ translation_m + device.translation_m
     return DeviceData(
-        numbers(device.focal_px), numbers(device.centre_px), lens, numbers(coefficients),
-        (numbers(turn[0]), numbers(turn[1]), numbers(turn[2])), numbers(shift),
-        numbers(-turn.T @ shift), numbers(device.image_size),
-    )  # fmt: skip
+        focal_px=numbers(device.focal_px),
+        centre_px=numbers(device.centre_px),
+        lens=lens,
+        coefficients=numbers(coefficients),
+        rotation=(numbers(turn[0]), numbers(turn[1]), numbers(turn[2])),
+        translation_m=_vector(shift),
+        position_m=_vector(-turn.T @ shift),
+        size_px=numbers(device.image_size),
+    )
 
 
 def numbers(values: Iterable[float]) -> Numbers:
@@ -81,8 +102,18 @@ def numbers(values: Iterable[float]) -> Numbers:
     return tuple(float(v) for v in values)
 
 
-#: For the parts of a kernel: handing surface and devices on by value costs more than their work.
-inlined = njit(nogil=True, error_model="numpy", forceinline=True, fastmath={"arcp", "contract"})
+def _vector(values: Iterable[float]) -> Vector:
+    x, y, z = map(float, values)
+    return x, y, z
+
+
+def inlined(function: _FunctionT) -> _FunctionT:
+    """Compile a part of a kernel: handing surface and devices on costs more than its work."""
+    compile_ = njit(
+        nogil=True, error_model="numpy", forceinline=True, fastmath={"arcp", "contract"}
+    )
+    compiled: _FunctionT = compile_(function)
+    return compiled
 
 
 @intrinsic
@@ -96,7 +127,7 @@ def _pointer(typing_context: Any, address: Any) -> Any:
 
 
 @kernel()
-def bare(surface: Any) -> Any:
+def bare(surface: SurfaceData) -> SurfaceData:
     """Return the surface with views of its arrays that are not reference-counted.
 
     Counting is atomic: done at every ray by every thread it costs ten times the ray.
@@ -114,7 +145,8 @@ def bare(surface: Any) -> Any:
 
 
 @kernel()
-def _brown(c: Any, x: float, y: float) -> Any:
+def _brown(c: Numbers, x: float, y: float) -> Vector:
+    """Radial factor and tangential shift (x, y) of OpenCV's k1 k2 p1 p2 k3."""
     r2 = x * x + y * y
     radial = 1.0 + r2 * (c[0] + r2 * (c[1] + r2 * c[4]))
     tx = 2.0 * c[2] * x * y + c[3] * (r2 + 2.0 * x * x)
@@ -123,8 +155,16 @@ def _brown(c: Any, x: float, y: float) -> Any:
 
 
 @inlined
-def ray(device: Any, u: float, v: float) -> Any:
-    """Direction (x, y, z), unit depth, of the ray through an observed pixel."""
+def ray(device: DeviceData, u: float, v: float) -> Vector:
+    """Direction (x, y, z), unit depth, of the ray through an observed pixel (Eq. 2).
+
+    Parameters
+    ----------
+    device : DeviceData
+        The device.
+    u, v : float
+        Observed pixel.
+    """
     du, dv = u - device.centre_px[0], v - device.centre_px[1]
     if device.lens == DIVISION:
         scale = 1.0 + device.coefficients[0] * (du * du + dv * dv)
@@ -144,8 +184,16 @@ def ray(device: Any, u: float, v: float) -> Any:
 
 
 @inlined
-def project(device: Any, x: float, y: float, z: float) -> Any:
-    """Observed pixel and depth (u, v, depth) of a point; (nan, nan, depth) where there is none."""
+def project(device: DeviceData, x: float, y: float, z: float) -> Vector:
+    """Observed pixel and depth (u, v, depth) of a point; (nan, nan, depth) where there is none.
+
+    Parameters
+    ----------
+    device : DeviceData
+        The device.
+    x, y, z : float
+        The point, part frame.
+    """
     R, T = device.rotation, device.translation_m
     depth = R[2][0] * x + R[2][1] * y + R[2][2] * z + T[2]
     if depth <= 0.0:
@@ -173,8 +221,16 @@ def project(device: Any, x: float, y: float, z: float) -> Any:
 
 
 @inlined
-def hole_distance(surface: Any, x: float, y: float) -> Any:
-    """Distance to the nearest lattice hole's axis, its radius (0: no hole), and its (cx, cy)."""
+def hole_distance(surface: SurfaceData, x: float, y: float) -> tuple[float, float, float, float]:
+    """Distance to the nearest lattice hole's axis, its radius (0: no hole), and its (cx, cy).
+
+    Parameters
+    ----------
+    surface : SurfaceData
+        Of kind HOLES.
+    x, y : float
+        Place on the part.
+    """
     pitch = surface.params[0]
     rows, columns = surface.grid.shape
     i = min(max(int(np.rint(x / pitch + surface.params[3])), 0), columns - 1)
@@ -185,8 +241,16 @@ def hole_distance(surface: Any, x: float, y: float) -> Any:
 
 
 @inlined
-def albedo(surface: Any, x: float, y: float) -> Any:
-    """Reflectance of the shape itself, relative to the finish."""
+def albedo(surface: SurfaceData, x: float, y: float) -> float:
+    """Reflectance of the shape itself, relative to the finish: 1 except in holes.
+
+    Parameters
+    ----------
+    surface : SurfaceData
+        The surface.
+    x, y : float
+        Place on the part.
+    """
     if surface.kind != HOLES:
         return 1.0
     r, radius, _, _ = hole_distance(surface, x, y)
@@ -194,10 +258,17 @@ def albedo(surface: Any, x: float, y: float) -> Any:
 
 
 @inlined
-def rim_distance(surface: Any, x: float, y: float) -> Any:
+def rim_distance(surface: SurfaceData, x: float, y: float) -> tuple[float, float]:
     """Distance outside the nearest rim of the nearest hole, and that rim's radius.
 
     A chamfer has a rim at its bottom and one at its top; (inf, 0) where there is no hole.
+
+    Parameters
+    ----------
+    surface : SurfaceData
+        The surface.
+    x, y : float
+        Place on the part.
     """
     if surface.kind != HOLES:
         return np.inf, 0.0
@@ -209,7 +280,7 @@ def rim_distance(surface: Any, x: float, y: float) -> Any:
 
 
 @inlined
-def _chamfer_height(surface: Any, x: float, y: float) -> Any:
+def _chamfer_height(surface: SurfaceData, x: float, y: float) -> Vector:
     """45 degree chamfer around each hole, then a floor: the hole itself is only dark."""
     r, radius, cx, cy = hole_distance(surface, x, y)
     chamfer = surface.params[1]
@@ -221,7 +292,7 @@ def _chamfer_height(surface: Any, x: float, y: float) -> Any:
 
 
 @inlined
-def _grid_height(surface: Any, x: float, y: float) -> Any:
+def _grid_height(surface: SurfaceData, x: float, y: float) -> Vector:
     """Bilinear height and its gradient; the border's height goes on outside."""
     grid, step = surface.grid, surface.params[0]
     rows, columns = grid.shape
@@ -241,15 +312,25 @@ def _grid_height(surface: Any, x: float, y: float) -> Any:
 
 
 @inlined
-def height_gradient(surface: Any, x: float, y: float) -> Any:
-    """Height and gradient (h, dh/dx, dh/dy) of the kinds that are solved for: HOLES and GRID."""
+def height_gradient(surface: SurfaceData, x: float, y: float) -> Vector:
+    """Height and gradient (h, dh/dx, dh/dy).
+
+    Parameters
+    ----------
+    surface : SurfaceData
+        Of a kind that is solved for: HOLES or GRID.
+    x, y : float
+        Place on the part.
+    """
     if surface.kind == GRID:
         return _grid_height(surface, x, y)
     return _chamfer_height(surface, x, y)
 
 
 @inlined
-def _hit_profile(surface: Any, ox: float, oz: float, dx: float, dz: float, nearest: float) -> Any:
+def _hit_profile(
+    surface: SurfaceData, ox: float, oz: float, dx: float, dz: float, nearest: float
+) -> Vector:
     """First t > nearest at which the ray meets the polyline, and that segment's normal."""
     best, nx, nz = np.inf, 0.0, 1.0
     vertices = surface.profile_m
@@ -275,7 +356,9 @@ def _hit_profile(surface: Any, ox: float, oz: float, dx: float, dz: float, neare
 
 
 @inlined
-def _hit_sphere(surface: Any, o: Any, d: Any, nearest: float) -> Any:
+def _hit_sphere(
+    surface: SurfaceData, o: Vector, d: Vector, nearest: float
+) -> tuple[float, float, float, float]:
     """First hit of a sphere cap that stands on the plane z = 0."""
     radius, base = surface.params[0], surface.params[1]
     cz = -np.sqrt(radius * radius - base * base)
@@ -300,7 +383,7 @@ def _hit_sphere(surface: Any, o: Any, d: Any, nearest: float) -> Any:
 
 
 @inlined
-def _refine(surface: Any, o: Any, d: Any, above: float, below: float) -> Any:
+def _refine(surface: SurfaceData, o: Vector, d: Vector, above: float, below: float) -> float:
     """Root of ray height over surface between ``above`` (> 0) and ``below`` (< 0): safe Newton."""
     t = 0.5 * (above + below)
     for _ in range(60):
@@ -321,7 +404,7 @@ def _refine(surface: Any, o: Any, d: Any, above: float, below: float) -> Any:
 
 
 @inlined
-def _hit_field(surface: Any, o: Any, d: Any) -> Any:
+def _hit_field(surface: SurfaceData, o: Vector, d: Vector) -> float:
     """First hit of a ray that comes down on a HOLES or GRID surface."""
     start = (surface.z_max_m + 1e-9 - o[2]) / d[2]
     stop = (surface.z_min_m - 1e-9 - o[2]) / d[2]
@@ -339,7 +422,7 @@ def _hit_field(surface: Any, o: Any, d: Any) -> Any:
 
 
 @inlined
-def first_hit(surface: Any, o: Any, d: Any) -> Any:
+def first_hit(surface: SurfaceData, o: Vector, d: Vector) -> tuple[float, float, float, float]:
     """First hit (t, nx, ny, nz) of a ray that comes from above; t is inf where there is none.
 
     Parameters
@@ -365,7 +448,8 @@ def first_hit(surface: Any, o: Any, d: Any) -> Any:
 
 
 @inlined
-def _shadow_field(surface: Any, p: Any, d: Any) -> Any:
+def _shadow_field(surface: SurfaceData, p: Vector, d: Vector) -> bool:
+    """Whether a HOLES or GRID surface is met on the way from p along d."""
     if d[2] <= 0.0:
         return True
     level = np.hypot(d[0], d[1])
@@ -382,8 +466,16 @@ def _shadow_field(surface: Any, p: Any, d: Any) -> Any:
 
 
 @inlined
-def shadowed(surface: Any, p: Any, light: Any) -> Any:
-    """Whether the surface stands between its own point p and the light; both (x, y, z)."""
+def shadowed(surface: SurfaceData, p: Vector, light: Vector) -> bool:
+    """Whether the surface stands between its own point p and the light.
+
+    Parameters
+    ----------
+    surface : SurfaceData
+        The surface.
+    p, light : tuple of float
+        Part frame.
+    """
     d = (light[0] - p[0], light[1] - p[1], light[2] - p[2])
     # t is 1 at the light, about 0.1 m away: 1e-7 steps 10 nm off the point's own facet.
     if surface.kind == PROFILE:

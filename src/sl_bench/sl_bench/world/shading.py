@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import uint64
 
 from sl_bench.world import raycast
 from sl_bench.world.optics import Finish, Optics
-from sl_bench.world.photons import mix
-from sl_bench.world.raycast import inlined
+from sl_bench.world.photons import Image, mix
+from sl_bench.world.raycast import DeviceData, Numbers, SurfaceData, Vector, View, inlined
 from sl_common.errors import ConfigError
 from sl_common.kernel_cache import kernel
 from sl_reconstruct.model.rig import Rig
@@ -31,6 +30,12 @@ RIM_LINES = 4
 RIM_STEPS = 5
 
 
+Rows = tuple[int, int]
+Pixel = tuple[float, float]
+#: Sample maps in the order of `Sample`.
+Maps = tuple[Image, ...]
+
+
 class Light(NamedTuple):
     """`Optics` and `Finish` as the kernels read them; ``gain`` makes white 1 at the origin."""
 
@@ -49,8 +54,33 @@ class Light(NamedTuple):
     texture_m: float
 
 
+class Sample(NamedTuple):
+    """What one camera ray sees."""
+
+    #: DMD coordinate that lights it, px.
+    u: float
+    v: float
+    #: Light relative to white.
+    reflected: float
+    ambient: float
+    #: Blur of the projector, DMD px^2, and of the lens beyond that in focus, camera px.
+    variance: float
+    extra_blur: float
+    #: Whether a hole's rim is within reach of a sample about the ray.
+    at_rim: bool
+
+
 def light_data(rig: Rig, optics: Optics, finish: Finish) -> Light:
     """Pack the settings; white is a matt plate z = 0 at the world's origin.
+
+    Parameters
+    ----------
+    rig : Rig
+        The true one.
+    optics : Optics
+        Blur and light.
+    finish : Finish
+        Of the part.
 
     Raises
     ------
@@ -82,22 +112,22 @@ def light_data(rig: Rig, optics: Optics, finish: Finish) -> Light:
 
 
 @inlined
-def _fall_off(size_px: Any, u: float, v: float, loss: float) -> Any:
+def _fall_off(size_px: Numbers, u: float, v: float, loss: float) -> float:
     """Quadratic loss from the middle of an image to its corner."""
     w, h = 0.5 * size_px[0], 0.5 * size_px[1]
     du, dv = u - w + 0.5, v - h + 0.5
-    return max(1.0 - loss * (du * du + dv * dv) / (w * w + h * h), 0.0)
+    return float(max(1.0 - loss * (du * du + dv * dv) / (w * w + h * h), 0.0))
 
 
 @kernel()
-def _lattice(i: int, j: int) -> Any:
+def _lattice(i: int, j: int) -> float:
     """Random number in [-1, 1) of a lattice point."""
-    bits = mix(uint64(i) * uint64(0x9E3779B97F4A7C15) + mix(uint64(j)))
-    return (bits >> uint64(40)) * (2.0 / 16777216.0) - 1.0
+    bits = mix(np.uint64(i) * np.uint64(0x9E3779B97F4A7C15) + mix(np.uint64(j)))
+    return (bits >> np.uint64(40)) * (2.0 / 16777216.0) - 1.0
 
 
 @inlined
-def _texture(x: float, y: float) -> Any:
+def _texture(x: float, y: float) -> float:
     """Smooth random field in [-1, 1], grain 1, over the part's own x and y."""
     i, j = np.floor(x), np.floor(y)
     fx, fy = x - i, y - j
@@ -105,34 +135,34 @@ def _texture(x: float, y: float) -> Any:
     i, j = int(i), int(j)
     low = _lattice(i, j) * (1.0 - fx) + _lattice(i + 1, j) * fx
     high = _lattice(i, j + 1) * (1.0 - fx) + _lattice(i + 1, j + 1) * fx
-    return low * (1.0 - fy) + high * fy
+    return float(low * (1.0 - fy) + high * fy)
 
 
 @inlined
-def _unit(x: float, y: float, z: float) -> Any:
+def _unit(x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """Direction of a vector, and its length."""
     length = np.sqrt(x * x + y * y + z * z)
     return x / length, y / length, z / length, length
 
 
 @inlined
-def _lobe(light: Any, n: Any, to_light: Any, to_eye: Any) -> Any:
+def _lobe(light: Light, n: Vector, to_light: Vector, to_eye: Vector) -> float:
     """Specular lobe about the mirror direction, over the half vector (Beckmann)."""
     hx, hy, hz, _ = _unit(to_light[0] + to_eye[0], to_light[1] + to_eye[1], to_light[2] + to_eye[2])
     c = n[0] * hx + n[1] * hy + n[2] * hz
     if c <= 0.0:
         return 0.0
-    return light.specular * np.exp(-(1.0 / (c * c) - 1.0) / (light.lobe_tan * light.lobe_tan))
+    slope2 = (1.0 / (c * c) - 1.0) / (light.lobe_tan * light.lobe_tan)
+    return float(light.specular * np.exp(-slope2))
 
 
 @inlined
-def _reflected(
-    surface: Any, projector: Any, light: Any, p: Any, n: Any, d: Any, base: float
-) -> Any:
+def _reflected(view: View, light: Light, p: Vector, n: Vector, d: Vector, base: float) -> float:
     """Share of the projector's light that point p sends along -d; 0 in shadow."""
-    o = projector.position_m
+    o = view.projector.position_m
     lx, ly, lz, distance = _unit(o[0] - p[0], o[1] - p[1], o[2] - p[2])
     cos_in = n[0] * lx + n[1] * ly + n[2] * lz
-    if cos_in <= 0.0 or raycast.shadowed(surface, p, o):
+    if cos_in <= 0.0 or raycast.shadowed(view.surface, p, o):
         return 0.0
     share = light.diffuse
     if light.specular > 0.0:
@@ -142,23 +172,19 @@ def _reflected(
 
 
 @inlined
-def _defocused(depth: float, focus: float, per_m: float) -> Any:
+def _defocused(depth: float, focus: float, per_m: float) -> float:
     """Standard deviation, px, that defocus adds in quadrature."""
     return per_m * (depth - focus)
 
 
 @inlined
-def sample(surface: Any, camera: Any, projector: Any, light: Any, qu: float, qv: float) -> Any:
-    """One camera ray: (u, v, reflected, ambient, projector variance, extra lens blur, at a rim).
-
-    (u, v) is the DMD coordinate that lights what the ray sees, px; reflected and ambient are
-    relative to white; the variance is in DMD px^2, the lens blur beyond focus in camera px.
-    At a rim there is a hole's rim within reach of a sample about the ray.
-    """
+def _sample(view: View, light: Light, qu: float, qv: float) -> Sample:
+    """One camera ray."""
+    surface, camera, projector = view.surface, view.camera, view.projector
     o, d = camera.position_m, raycast.ray(camera, qu, qv)
     t, nx, ny, nz = raycast.first_hit(surface, (o[0], o[1], o[2]), d)
     if not t < np.inf:
-        return NOWHERE_PX, NOWHERE_PX, 0.0, 0.0, 0.0, 0.0, False
+        return Sample(NOWHERE_PX, NOWHERE_PX, 0.0, 0.0, 0.0, 0.0, False)
     p = (o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2])
     off, _ = raycast.rim_distance(surface, p[0], p[1])
     at_rim = abs(off) < RIM_REACH * SAMPLE_PX * t / camera.focal_px[0]
@@ -171,18 +197,18 @@ def sample(surface: Any, camera: Any, projector: Any, light: Any, qu: float, qv:
     spread = _defocused(depth, light.projector_focus_m, light.projector_defocus)
     extra = _defocused(t, light.lens_focus_m, light.lens_defocus)
     if not (abs(u) < 1e5 and abs(v) < 1e5):
-        return NOWHERE_PX, NOWHERE_PX, 0.0, ambient, 0.0, extra, at_rim
+        return Sample(NOWHERE_PX, NOWHERE_PX, 0.0, ambient, 0.0, extra, at_rim)
     reflected = 0.0
     pad = 4.0 * MAX_BLUR_PX
     if -pad < u < projector.size_px[0] + pad and -pad < v < projector.size_px[1] + pad:
-        reflected = _reflected(surface, projector, light, p, (nx, ny, nz), d, base)
+        reflected = _reflected(view, light, p, (nx, ny, nz), d, base)
         reflected *= _fall_off(projector.size_px, u, v, light.uneven)
     variance = light.projector_blur_px**2 + spread * spread
-    return u, v, reflected, ambient, variance, extra, at_rim
+    return Sample(u, v, reflected, ambient, variance, extra, at_rim)
 
 
 @inlined
-def _off_rim(surface: Any, camera: Any, qu: float, qv: float, rim_m: float) -> Any:
+def _off_rim(surface: SurfaceData, camera: DeviceData, qu: float, qv: float, rim_m: float) -> float:
     """Distance outside a circle about the axis of the hole that a camera ray sees."""
     o, d = camera.position_m, raycast.ray(camera, qu, qv)
     t, _, _, _ = raycast.first_hit(surface, (o[0], o[1], o[2]), d)
@@ -190,7 +216,9 @@ def _off_rim(surface: Any, camera: Any, qu: float, qv: float, rim_m: float) -> A
 
 
 @kernel()
-def _crossing(surface: Any, camera: Any, q: Any, along: Any, rim_m: float) -> Any:
+def _crossing(
+    surface: SurfaceData, camera: DeviceData, q: Pixel, along: Pixel, rim_m: float
+) -> float:
     """Where in [-1, 1] a line ``q + x along`` crosses a rim; 1 where it does not (Illinois)."""
     a, b = -1.0, 1.0
     fa = _off_rim(surface, camera, q[0] - along[0], q[1] - along[1], rim_m)
@@ -209,7 +237,7 @@ def _crossing(surface: Any, camera: Any, q: Any, along: Any, rim_m: float) -> An
 
 
 @kernel()
-def _across_rim(surface: Any, camera: Any, q: Any, rim_m: float) -> Any:
+def _across_rim(surface: SurfaceData, camera: DeviceData, q: Pixel, rim_m: float) -> Pixel:
     """Half a sample's side (du, dv) along the image axis that crosses the rim more squarely."""
     h = 0.5 * SAMPLE_PX
     by_u = _off_rim(surface, camera, q[0] + h, q[1], rim_m)
@@ -220,12 +248,13 @@ def _across_rim(surface: Any, camera: Any, q: Any, rim_m: float) -> Any:
 
 
 @kernel()
-def straddling(surface: Any, camera: Any, projector: Any, light: Any, q: Any) -> Any:
+def _straddling(view: View, light: Light, q: Pixel) -> tuple[float, float]:
     """Mean (reflected, ambient) over a sample that straddles rims of a hole.
 
     On each of a few lines through the sample, hole, chamfer and face count with their exact
     lengths: a ramp over the rim would shift it where slope and floor are foreshortened unlike.
     """
+    surface, camera = view.surface, view.camera
     o, d = camera.position_m, raycast.ray(camera, q[0], q[1])
     t, _, _, _ = raycast.first_hit(surface, (o[0], o[1], o[2]), d)
     _, rim_m = raycast.rim_distance(surface, o[0] + t * d[0], o[1] + t * d[1])
@@ -241,45 +270,54 @@ def straddling(surface: Any, camera: Any, projector: Any, light: Any, q: Any) ->
         for stop in (min(one, two), max(one, two), 1.0):
             if stop > start:
                 x = 0.5 * (start + stop)
-                found = sample(
-                    surface, camera, projector, light, at[0] + x * along[0], at[1] + x * along[1]
-                )
-                reflected += (stop - start) * found[2]
-                ambient += (stop - start) * found[3]
+                found = _sample(view, light, at[0] + x * along[0], at[1] + x * along[1])
+                reflected += (stop - start) * found.reflected
+                ambient += (stop - start) * found.ambient
                 start = stop
     return reflected / (2.0 * RIM_LINES), ambient / (2.0 * RIM_LINES)
 
 
 @kernel()
-def trace_rows(
-    surface: Any, camera: Any, projector: Any, light: Any, margin: int, rows: Any, maps: Any
-) -> None:
-    """Fill rows [rows[0], rows[1]) of six sample maps (2 (H + 2 margin), 2 (W + 2 margin)) float32.
+def trace_rows(view: View, light: Light, margin: int, rows: Rows, maps: Maps) -> None:
+    """Fill some rows of six sample maps.
 
-    Samples lie at -0.25 and +0.25 px of each pixel; the image has ``margin`` pixels more on each
-    side. Maps are in the order that `sample` returns. A sample is what its middle ray sees; where
-    a hole's rim goes through it, its light is the mean over its square.
+    Samples lie at -0.25 and +0.25 px of each pixel. A sample is what its middle ray sees; where a
+    hole's rim goes through it, its light is the mean over its square.
+
+    Parameters
+    ----------
+    view : View
+        Part and devices.
+    light : Light
+        From `light_data`.
+    margin : int
+        Pixels that the maps have more than the image on each side.
+    rows : tuple of int
+        First row of the maps and the one behind the last.
+    maps : tuple of ndarray, (2 (H + 2 margin), 2 (W + 2 margin)) float32
+        Receive u, v, reflected, ambient, variance, extra blur; see `Sample`.
     """
-    surface = raycast.bare(surface)
+    view = View(raycast.bare(view.surface), view.camera, view.projector)
     for j in range(rows[0], rows[1]):
         for i in range(maps[0].shape[1]):
             q = (SAMPLE_PX * i - 0.25 - margin, SAMPLE_PX * j - 0.25 - margin)
-            found = sample(surface, camera, projector, light, q[0], q[1])
-            maps[0][j, i], maps[1][j, i], maps[2][j, i] = found[0], found[1], found[2]
-            maps[3][j, i], maps[4][j, i], maps[5][j, i] = found[3], found[4], found[5]
-            if found[6]:
-                maps[2][j, i], maps[3][j, i] = straddling(surface, camera, projector, light, q)
+            found = _sample(view, light, q[0], q[1])
+            maps[0][j, i], maps[1][j, i], maps[2][j, i] = found.u, found.v, found.reflected
+            maps[3][j, i], maps[4][j, i] = found.ambient, found.variance
+            maps[5][j, i] = found.extra_blur
+            if found.at_rim:
+                maps[2][j, i], maps[3][j, i] = _straddling(view, light, q)
 
 
 @inlined
-def _slope(before: float, here: float, after: float) -> Any:
+def _slope(before: float, here: float, after: float) -> float:
     """Change per sample, by the smoother side: a jump of the surface is no slope."""
     a, b = here - before, after - here
     return a if abs(a) < abs(b) else b
 
 
 @kernel()
-def _carry(m: Any, j: int, spread: Any, extra: Any, out: Any) -> None:
+def _carry(m: Image, j: int, spread: Image, extra: Image, out: Image) -> None:
     """Variance on the DMD along one of its axes, px^2, of a row of samples.
 
     The squared gradient of the map, per camera pixel squared, carries the lens's extra blur to
@@ -301,10 +339,17 @@ def _carry(m: Any, j: int, spread: Any, extra: Any, out: Any) -> None:
 
 
 @kernel()
-def blur_rows(maps: Any, rows: Any) -> None:
+def blur_rows(maps: Maps, rows: Rows) -> None:
     """Turn maps 4 and 5 into the variances of columns and of rows on the DMD, px^2.
 
     The lens's blur beyond that in focus is carried to the DMD by the local gradient of u (v).
+
+    Parameters
+    ----------
+    maps : tuple of ndarray
+        From `trace_rows`.
+    rows : tuple of int
+        First row and the one behind the last.
     """
     spread = np.empty(maps[0].shape[1], dtype=np.float32)
     extra = np.empty_like(spread)
@@ -315,8 +360,16 @@ def blur_rows(maps: Any, rows: Any) -> None:
 
 
 @kernel()
-def variance_range(variance: Any, lit: Any, rows: Any) -> Any:
-    """Smallest and largest variance of lit samples; (inf, 0) where none is."""
+def variance_range(variance: Image, lit: Image, rows: Rows) -> tuple[float, float]:
+    """Smallest and largest variance of lit samples; (inf, 0) where none is.
+
+    Parameters
+    ----------
+    variance, lit : ndarray
+        Sample maps: blur, reflected light.
+    rows : tuple of int
+        First row and the one behind the last.
+    """
     low, high = np.inf, 0.0
     for j in range(rows[0], rows[1]):
         for i in range(lit.shape[1]):

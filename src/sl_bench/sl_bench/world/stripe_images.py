@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_common.kernel_cache import kernel
 
+Image = NDArray[np.float32]
+Rows = tuple[int, int]
+#: Flat index, share of the next entry, share of the next level, of a row of samples.
+Places = tuple[NDArray[np.int32], Image, Image]
+
 #: Entries of a blurred line per DMD pixel; linear between.
 PHASES = 32
 #: Blur levels are closer than this fraction of the smallest variance, up to MAX_LEVELS of them.
 LEVEL_STEP = 0.08
 MAX_LEVELS = 48
-#: So many samples of a row are asked together whether the lit DMD's border is far.
+#: Samples of a row that are checked together for being far from the lit DMD's border.
 CHUNK = 64
 #: A Gaussian is cut off at this many standard deviations.
 REACH = 4.5
@@ -32,11 +37,61 @@ class Levels(NamedTuple):
     per_step: float
     levels: int
     reach: int
-    weights: NDArray[np.float32]
+    weights: Image
+
+
+class Scale(NamedTuple):
+    """Numbers of `Levels` alone: an array passed on with them is counted at every sample."""
+
+    first: np.float32
+    per_step: np.float32
+    levels: np.int32
+    offset: np.float32
+
+
+class Samples(NamedTuple):
+    """Sample maps, for a pattern that varies along one DMD axis (u for any other).
+
+    Coordinate along the pattern and across it, px; reflected light; variance of the blur along
+    and across, px^2.
+    """
+
+    along: Image
+    across: Image
+    light: Image
+    spread: Image
+    spread_across: Image
+
+
+class Stripes(NamedTuple):
+    """A pattern that varies along one DMD axis.
+
+    ``line`` and ``border`` are `blurred_line` of the pattern and of the lit DMD across it. Between
+    the two coordinates ``safe`` across, px, the border has no influence.
+    """
+
+    line: Image
+    border: Image
+    levels: tuple[Levels, Levels]
+    safe: tuple[float, float]
+
+
+class MirrorImage(NamedTuple):
+    """Any mirror image, 0 or 1, padded by twice each axis's reach (rows, columns)."""
+
+    mirrors: Image
+    levels: tuple[Levels, Levels]
+
+
+class Lens(NamedTuple):
+    """What makes pixels of samples: `lens_weights`, and electrons per second of white."""
+
+    weights: Image
+    scale: np.float32
 
 
 @kernel(error_model="python")
-def _mirror_weights(variances: Any, reach: int) -> Any:
+def _mirror_weights(variances: NDArray[np.float64], reach: int) -> Image:
     """Integral over each mirror of a Gaussian about the phase."""
     weights = np.empty((PHASES + 1, 2 * reach + 1, variances.size), dtype=np.float32)
     for phase in range(PHASES + 1):
@@ -50,20 +105,33 @@ def _mirror_weights(variances: Any, reach: int) -> Any:
 
 
 def blur_levels(lowest: float, highest: float) -> Levels:
-    """Levels between two variances, px^2."""
+    """Levels of blur.
+
+    Parameters
+    ----------
+    lowest, highest : float
+        Variances, px^2.
+    """
     steps = math.ceil((highest - lowest) / (LEVEL_STEP * lowest))
     count = min(max(steps + 1, 2), MAX_LEVELS)
     step = max(highest - lowest, 1e-6) / (count - 1)
-    variances = lowest + step * np.arange(count)
+    variances = np.asarray(lowest + step * np.arange(count), dtype=np.float64)
     reach = math.ceil(REACH * math.sqrt(variances[-1])) + 1
     return Levels(lowest, 1.0 / step, count, reach, _mirror_weights(variances, reach))
 
 
 @kernel(error_model="python")
-def blurred_line(profile: Any, levels: Any) -> Any:
+def blurred_line(profile: NDArray[np.bool_], levels: Levels) -> Image:
     """Blurred 1-D pattern ((size + 2 reach) PHASES + 1, levels), from u = -reach - 0.5 on.
 
     Its ends are dark, so that all beyond may be looked up there.
+
+    Parameters
+    ----------
+    profile : ndarray, (size,)
+        Mirrors along the pattern.
+    levels : Levels
+        Of that axis.
     """
     reach, size = levels.reach, profile.size
     out = np.zeros(((size + 2 * reach) * PHASES + 1, levels.levels), dtype=np.float32)
@@ -77,32 +145,34 @@ def blurred_line(profile: Any, levels: Any) -> Any:
 
 
 @kernel(error_model="python", fastmath=True)
-def _level(scale: Any, variance: Any) -> Any:
-    """Level below a variance, and the share of the one above; scale: first, per step, levels."""
-    q = (variance - scale[0]) * scale[1]
-    k = np.int32(min(max(np.int32(q), np.int32(0)), np.int32(scale[2] - 2)))
+def _level(scale: Scale, variance: np.float32) -> tuple[np.int32, np.float32]:
+    """Level below a variance, and the share of the one above."""
+    q = (variance - scale.first) * scale.per_step
+    k = np.int32(min(max(np.int32(q), np.int32(0)), np.int32(scale.levels - 2)))
     return k, q - np.float32(k)
 
 
 @kernel(error_model="python", fastmath=True)
-def _scale(levels: Any) -> Any:
-    """Numbers of `Levels` alone: an array handed on with them is counted at every sample."""
+def _scale(levels: Levels) -> Scale:
     offset = np.float32(levels.reach + 0.5)
-    return np.float32(levels.first), np.float32(levels.per_step), np.int32(levels.levels), offset
+    first, per_step = np.float32(levels.first), np.float32(levels.per_step)
+    return Scale(first, per_step, np.int32(levels.levels), offset)
 
 
 @kernel(error_model="python", fastmath=True)
-def _place(scale: Any, entries: Any, x: Any, variance: Any) -> Any:
-    """Where a coordinate, px, falls in a blurred line: flat index, shares of next entry, level."""
-    at = (x + scale[3]) * np.float32(PHASES)
+def _place(
+    scale: Scale, entries: int, x: np.float32, variance: np.float32
+) -> tuple[np.int32, np.float32, np.float32]:
+    """Where a coordinate, px, falls in a blurred line; see `Places`."""
+    at = (x + scale.offset) * np.float32(PHASES)
     at = min(max(at, np.float32(0.0)), np.float32(entries - 1))
     entry = np.int32(min(np.int32(at), np.int32(entries - 2)))
     k, g = _level(scale, variance)
-    return np.int32(entry * scale[2] + k), at - np.float32(entry), g
+    return np.int32(entry * scale.levels + k), at - np.float32(entry), g
 
 
 @kernel(error_model="python", fastmath=True)
-def _places(scale: Any, entries: Any, x: Any, variance: Any, places: Any) -> None:
+def _places(scale: Scale, entries: int, x: Image, variance: Image, places: Places) -> None:
     """`_place` of a row; apart from the look-up, so that it is made of vector instructions."""
     place, f, g = places
     for i in range(x.size):
@@ -110,16 +180,18 @@ def _places(scale: Any, entries: Any, x: Any, variance: Any, places: Any) -> Non
 
 
 @kernel(error_model="python", fastmath=True)
-def _between(line: Any, place: Any, levels: int, f: Any, g: Any) -> Any:
+def _between(
+    line: Image, place: np.int32, levels: np.int32, f: np.float32, g: np.float32
+) -> np.float32:
     """Brightness at a place of a blurred line, given flat."""
     here, there = line[place], line[place + 1]
     low = here + f * (line[place + levels] - here)
     high = there + f * (line[place + levels + 1] - there)
-    return low + g * (high - low)
+    return np.float32(low + g * (high - low))
 
 
 @kernel(error_model="python", fastmath=True)
-def _tap_weights(levels: Any, fraction: Any, variance: Any, out: Any) -> None:
+def _tap_weights(levels: Levels, fraction: np.float32, variance: np.float32, out: Image) -> None:
     """Weights of the mirrors about a point at that fraction of its mirror."""
     at = fraction * PHASES
     i = min(int(at), PHASES - 1)
@@ -133,9 +205,16 @@ def _tap_weights(levels: Any, fraction: Any, variance: Any, out: Any) -> None:
 
 
 @kernel(error_model="python", fastmath=True)
-def _on_mirrors(mirrors: Any, levels: Any, q: Any, variance: Any, wu: Any, wv: Any) -> Any:
-    """Brightness of a mirror image, padded by each axis's reach, at (u, v)."""
+def _on_mirrors(
+    image: MirrorImage,
+    q: tuple[np.float32, np.float32],
+    variance: tuple[np.float32, np.float32],
+    scratch: tuple[Image, Image],
+) -> np.float32:
+    """Brightness of a mirror image at (u, v)."""
     column, row = int(np.floor(q[0] + 0.5)), int(np.floor(q[1] + 0.5))
+    mirrors, levels = image.mirrors, image.levels
+    wu, wv = scratch
     ru, rv = levels[0].reach, levels[1].reach
     height, width = mirrors.shape[0] - 4 * rv, mirrors.shape[1] - 4 * ru
     if not (-ru <= column < width + ru and -rv <= row < height + rv):
@@ -166,7 +245,7 @@ def lens_weights(blur_px: float) -> NDArray[np.float32]:
 
 
 @kernel(error_model="python", fastmath=True)
-def _across(even: Any, odd: Any, weights: Any, out: Any) -> None:
+def _across(even: Image, odd: Image, weights: Image, out: Image) -> None:
     """Filter a row of samples, given as its even and odd ones, to pixels."""
     out[:] = np.float32(0.0)
     for tap in range(weights.shape[1]):
@@ -176,18 +255,21 @@ def _across(even: Any, odd: Any, weights: Any, out: Any) -> None:
 
 
 @kernel(error_model="python", fastmath=True)
-def _down(lines: Any, weights: Any, first: int, scale: Any, out: Any) -> None:
+def _down(lines: Image, lens: Lens, first: int, out: Image) -> None:
     """Filter rows of samples to one row of pixels."""
+    weights = lens.weights
     out[:] = np.float32(0.0)
     for tap in range(weights.shape[1]):
-        a, b = weights[0, tap] * scale, weights[1, tap] * scale
+        a, b = weights[0, tap] * lens.scale, weights[1, tap] * lens.scale
         even, odd = lines[first + 2 * tap], lines[first + 2 * tap + 1]
         for x in range(out.size):
             out[x] += a * even[x] + b * odd[x]
 
 
 @kernel(error_model="python", fastmath=True)
-def _line_samples(light: Any, line: Any, levels: int, places: Any, even: Any, odd: Any) -> None:
+def _line_samples(
+    light: Image, line: Image, levels: np.int32, places: Places, even: Image, odd: Image
+) -> None:
     """Light of one row of samples under a 1-D pattern."""
     place, f, g = places
     for i in range(even.size):
@@ -197,7 +279,7 @@ def _line_samples(light: Any, line: Any, levels: int, places: Any, even: Any, od
 
 
 @kernel(error_model="python", fastmath=True)
-def _all_between(x: Any, low: Any, high: Any) -> bool:
+def _all_between(x: Image, low: np.float32, high: np.float32) -> bool:
     inside = np.int32(0)
     for i in range(x.size):
         inside += np.int32((x[i] > low) & (x[i] < high))
@@ -206,10 +288,11 @@ def _all_between(x: Any, low: Any, high: Any) -> bool:
 
 @kernel(error_model="python", fastmath=True)
 def _border(
-    across: Any, variance: Any, line: Any, scale: Any, safe: Any, even: Any, odd: Any
+    across: Image, variance: Image, stripes: Stripes, scale: Scale, even: Image, odd: Image
 ) -> None:
     """Darken the samples near and beyond the lit DMD's border."""
-    flat, low, high = line.ravel(), np.float32(safe[0]), np.float32(safe[1])
+    flat, entries = stripes.border.ravel(), stripes.border.shape[0]
+    low, high = np.float32(stripes.safe[0]), np.float32(stripes.safe[1])
     for first in range(0, across.size, CHUNK):
         end = min(first + CHUNK, across.size)
         if _all_between(across[first:end], low, high):
@@ -217,36 +300,28 @@ def _border(
         for i in range(first, end):
             half = odd if i & 1 else even
             if half[i >> 1] > np.float32(0.0):
-                place, f, g = _place(scale, line.shape[0], across[i], variance[i])
-                half[i >> 1] *= _between(flat, place, scale[2], f, g)
+                place, f, g = _place(scale, entries, across[i], variance[i])
+                half[i >> 1] *= _between(flat, place, scale.levels, f, g)
 
 
 @kernel(error_model="python", fastmath=True)
-def render_lines(
-    maps: Any, lines: Any, levels: Any, safe: Any, weights: Any, scale: Any, rows: Any, out: Any
-) -> None:
+def render_lines(maps: Samples, stripes: Stripes, lens: Lens, rows: Rows, out: Image) -> None:
     """Rows of the image under a pattern that varies along one DMD axis.
 
     Parameters
     ----------
-    maps : tuple of ndarray
-        Sample maps: coordinate along the pattern, across it, reflectance, variance along, across.
-    lines : tuple of ndarray
-        `blurred_line` of the pattern, and of the lit DMD across it.
-    levels : tuple of Levels
-        Along, across.
-    safe : tuple of float
-        Between these coordinates across, the DMD's border has no influence.
-    weights : ndarray
-        From `lens_weights`.
-    scale : float32
-        Electrons per second of white.
+    maps : Samples
+        What the samples see.
+    stripes : Stripes
+        The pattern.
+    lens : Lens
+        From samples to pixels.
     rows : tuple of int
         First row and the one behind the last.
     out : ndarray, (H, W) float32
         Receives electrons per second.
     """
-    taps, width = weights.shape[1], out.shape[1]
+    taps, width = lens.weights.shape[1], out.shape[1]
     even = np.empty(width + taps - 1, dtype=np.float32)
     odd = np.empty_like(even)
     places = (
@@ -254,30 +329,30 @@ def render_lines(
         np.empty(2 * even.size, dtype=np.float32),
         np.empty(2 * even.size, dtype=np.float32),
     )
-    along, across, light, spread, spread_across = maps
-    flat, scales = lines[0].ravel(), (_scale(levels[0]), _scale(levels[1]))
+    flat, entries = stripes.line.ravel(), stripes.line.shape[0]
+    along, across = _scale(stripes.levels[0]), _scale(stripes.levels[1])
     samples = np.empty((2 * (rows[1] - rows[0] + taps - 1), width), dtype=np.float32)
     for k in range(samples.shape[0]):
         j = 2 * rows[0] + k
-        _places(scales[0], lines[0].shape[0], along[j], spread[j], places)
-        _line_samples(light[j], flat, scales[0][2], places, even, odd)
-        _border(across[j], spread_across[j], lines[1], scales[1], safe, even, odd)
-        _across(even, odd, weights, samples[k])
+        _places(along, entries, maps.along[j], maps.spread[j], places)
+        _line_samples(maps.light[j], flat, along.levels, places, even, odd)
+        _border(maps.across[j], maps.spread_across[j], stripes, across, even, odd)
+        _across(even, odd, lens.weights, samples[k])
     for y in range(rows[0], rows[1]):
-        _down(samples, weights, 2 * (y - rows[0]), scale, out[y])
+        _down(samples, lens, 2 * (y - rows[0]), out[y])
 
 
 @kernel(error_model="python", fastmath=True)
 def _mirror_samples(
-    maps: Any, j: int, mirrors: Any, levels: Any, scratch: Any, even: Any, odd: Any
+    maps: Samples, j: int, image: MirrorImage, scratch: tuple[Image, Image], even: Image, odd: Image
 ) -> None:
     """Light of one row of samples under any mirror image."""
-    for i in range(maps[0].shape[1]):
-        value = maps[2][j, i]
+    for i in range(maps.along.shape[1]):
+        value = maps.light[j, i]
         if value > np.float32(0.0):
-            q = (maps[0][j, i], maps[1][j, i])
-            variance = (maps[3][j, i], maps[4][j, i])
-            value *= _on_mirrors(mirrors, levels, q, variance, scratch[0], scratch[1])
+            q = (maps.along[j, i], maps.across[j, i])
+            variance = (maps.spread[j, i], maps.spread_across[j, i])
+            value *= _on_mirrors(image, q, variance, scratch)
         if i & 1:
             odd[i >> 1] = value
         else:
@@ -285,33 +360,46 @@ def _mirror_samples(
 
 
 @kernel(error_model="python", fastmath=True)
-def render_mirrors(
-    maps: Any, mirrors: Any, levels: Any, weights: Any, scale: Any, rows: Any, out: Any
-) -> None:
-    """Rows of the image under any mirror image, padded by twice each axis's reach.
+def render_mirrors(maps: Samples, image: MirrorImage, lens: Lens, rows: Rows, out: Image) -> None:
+    """Rows of the image under any mirror image.
 
-    Parameters are those of `render_lines`; ``mirrors`` is float32, 0 or 1.
+    Parameters
+    ----------
+    maps : Samples
+        What the samples see.
+    image : MirrorImage
+        The mirrors.
+    lens, rows, out
+        See `render_lines`.
     """
-    taps, width = weights.shape[1], out.shape[1]
+    taps, width = lens.weights.shape[1], out.shape[1]
     even = np.empty(width + taps - 1, dtype=np.float32)
     odd = np.empty_like(even)
-    most = 2 * max(levels[0].reach, levels[1].reach) + 1
+    most = 2 * max(image.levels[0].reach, image.levels[1].reach) + 1
     scratch = (np.empty(most, dtype=np.float32), np.empty(most, dtype=np.float32))
     samples = np.empty((2 * (rows[1] - rows[0] + taps - 1), width), dtype=np.float32)
     for k in range(samples.shape[0]):
-        _mirror_samples(maps, 2 * rows[0] + k, mirrors, levels, scratch, even, odd)
-        _across(even, odd, weights, samples[k])
+        _mirror_samples(maps, 2 * rows[0] + k, image, scratch, even, odd)
+        _across(even, odd, lens.weights, samples[k])
     for y in range(rows[0], rows[1]):
-        _down(samples, weights, 2 * (y - rows[0]), scale, out[y])
+        _down(samples, lens, 2 * (y - rows[0]), out[y])
 
 
 @kernel(error_model="python", fastmath=True)
-def render_plain(light: Any, weights: Any, scale: Any, rows: Any, out: Any) -> None:
-    """Rows of the image of a sample map as it is: ambient light."""
-    taps, width = weights.shape[1], out.shape[1]
+def render_plain(light: Image, lens: Lens, rows: Rows, out: Image) -> None:
+    """Rows of the image of a sample map as it is: ambient light.
+
+    Parameters
+    ----------
+    light : ndarray
+        Sample map.
+    lens, rows, out
+        See `render_lines`.
+    """
+    taps, width = lens.weights.shape[1], out.shape[1]
     samples = np.empty((2 * (rows[1] - rows[0] + taps - 1), width), dtype=np.float32)
     for k in range(samples.shape[0]):
         line = light[2 * rows[0] + k]
-        _across(line[::2], line[1::2], weights, samples[k])
+        _across(line[::2], line[1::2], lens.weights, samples[k])
     for y in range(rows[0], rows[1]):
-        _down(samples, weights, 2 * (y - rows[0]), scale, out[y])
+        _down(samples, lens, 2 * (y - rows[0]), out[y])

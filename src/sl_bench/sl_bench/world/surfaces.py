@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from sl_bench.world import raycast
 from sl_bench.world.coin_relief import coin_heights
 from sl_bench.world.height_files import read_height_file
+from sl_bench.world.raycast import SurfaceData, Vector
 from sl_common.errors import ConfigError
 from sl_common.kernel_cache import kernel
 
@@ -26,8 +27,6 @@ Array = NDArray[np.float64]
 
 #: Half of the side of a profile surface: further than any ray of a bench goes.
 FAR_M = 10.0
-_NO_GRID = np.zeros((2, 2))
-_NO_PROFILE = np.zeros((0, 2))
 
 
 @dataclass(frozen=True)
@@ -45,20 +44,16 @@ class Surface:
     name: str
     data: raycast.SurfaceData
 
-    @property
-    def max_slope(self) -> float:
-        """Steepest |gradient|; inf where there are vertical walls."""
-        return self.data.max_slope
-
     def height_m(self, x_m: Array, y_m: Array) -> Array:
-        """Height at (x, y), arrays of one shape; at a vertical wall, its upper edge."""
-        x, y = np.broadcast_arrays(np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float))
-        return np.asarray(_heights(self.data, x.ravel(), y.ravel())).reshape(x.shape)
+        """Height of places on the part, metres; at a vertical wall, of its upper edge.
 
-    def albedo(self, x_m: Array, y_m: Array) -> Array:
-        """Reflectance relative to the finish, 1 except in holes; arrays of one shape."""
+        Parameters
+        ----------
+        x_m, y_m : ndarray
+            Of shapes that broadcast, which is the result's.
+        """
         x, y = np.broadcast_arrays(np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float))
-        return np.asarray(_albedos(self.data, x.ravel(), y.ravel())).reshape(x.shape)
+        return _heights(self.data, x.ravel(), y.ravel()).reshape(x.shape)
 
     def distance_m(self, points_m: Array) -> Array:
         """Unsigned distance of points (N, 3), part frame, to the surface: (N,) metres.
@@ -69,7 +64,7 @@ class Surface:
 
 
 @kernel()
-def _heights(data, x, y):  # type: ignore[no-untyped-def]
+def _heights(data: SurfaceData, x: Array, y: Array) -> Array:
     out = np.empty(x.size)
     for i in range(x.size):
         t, _, _, _ = raycast.first_hit(data, (x[i], y[i], 1.0), (0.0, 0.0, -1.0))
@@ -77,15 +72,7 @@ def _heights(data, x, y):  # type: ignore[no-untyped-def]
     return out
 
 
-@kernel()
-def _albedos(data, x, y):  # type: ignore[no-untyped-def]
-    out = np.empty(x.size)
-    for i in range(x.size):
-        out[i] = raycast.albedo(data, x[i], y[i])
-    return out
-
-
-def polyline_distance_m(s_m: Array, z_m: Array, vertices_m: Array) -> Array:
+def _polyline_distance_m(s_m: Array, z_m: Array, vertices_m: Array) -> Array:
     """Distance of points (s, z), each (N,), to a polyline with vertices (V, 2): (N,) metres."""
     best = np.full(np.shape(s_m), np.inf)
     for (s0, z0), (s1, z1) in itertools.pairwise(vertices_m):
@@ -100,7 +87,7 @@ class ProfileSurface(Surface):
     """A profile in x and z drawn out along y: flat plate, groove, steps."""
 
     def distance_m(self, points_m: Array) -> Array:  # noqa: D102
-        return polyline_distance_m(points_m[:, 0], points_m[:, 2], self.data.profile_m)
+        return _polyline_distance_m(points_m[:, 0], points_m[:, 2], self.data.profile_m)
 
 
 class HolePlate(Surface):
@@ -119,13 +106,15 @@ class HolePlate(Surface):
         z, chamfer = points_m[:, 2], self.data.params[1]
         if chamfer == 0.0:
             return np.abs(z)
-        distance = np.asarray(_hole_distances(self.data, points_m[:, 0], points_m[:, 1]))
+        distance = _hole_distances(self.data, points_m[:, 0], points_m[:, 1])
         profile = np.array([[-FAR_M, -chamfer], [0.0, -chamfer], [chamfer, 0.0], [FAR_M, 0.0]])
-        return np.where(np.isfinite(distance), polyline_distance_m(distance, z, profile), np.abs(z))
+        return np.where(
+            np.isfinite(distance), _polyline_distance_m(distance, z, profile), np.abs(z)
+        )
 
 
 @kernel()
-def _hole_distances(data, x, y):  # type: ignore[no-untyped-def]
+def _hole_distances(data: SurfaceData, x: Array, y: Array) -> Array:
     """Distance outside the rim of the nearest hole; inf where that hole is blocked."""
     out = np.empty(x.size)
     for i in range(x.size):
@@ -151,17 +140,18 @@ class GridSurface(Surface):
     """Heights on a square grid, bilinear between."""
 
     def distance_m(self, points_m: Array) -> Array:  # noqa: D102
-        return np.asarray(_grid_distances(self.data, np.ascontiguousarray(points_m, dtype=float)))
+        return _grid_distances(self.data, np.ascontiguousarray(points_m, dtype=float))
 
 
 @kernel()
-def _gap(data, p, x, y):  # type: ignore[no-untyped-def]
+def _gap(data: SurfaceData, p: Array, x: float, y: float) -> float:
+    """Distance of a point to the surface's point at (x, y)."""
     h, _, _ = raycast.height_gradient(data, x, y)
-    return np.sqrt((p[0] - x) ** 2 + (p[1] - y) ** 2 + (p[2] - h) ** 2)
+    return float(np.sqrt((p[0] - x) ** 2 + (p[1] - y) ** 2 + (p[2] - h) ** 2))
 
 
 @kernel()
-def _nearest_start(data, p):  # type: ignore[no-untyped-def]
+def _nearest_start(data: SurfaceData, p: Array) -> Vector:
     """Nearest of 21 x 21 feet around a point: the true foot is no further off than |z - h|."""
     best_x, best_y, best = p[0], p[1], _gap(data, p, p[0], p[1])
     reach = best
@@ -177,7 +167,7 @@ def _nearest_start(data, p):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _grid_distances(data, points):  # type: ignore[no-untyped-def]
+def _grid_distances(data: SurfaceData, points: Array) -> Array:
     """Distance to the start's foot, moved along tangent planes, by ever smaller steps."""
     out = np.empty(points.shape[0])
     for k in range(points.shape[0]):
@@ -199,8 +189,27 @@ def _grid_distances(data, points):  # type: ignore[no-untyped-def]
     return out
 
 
-def _params(*values: float) -> raycast.Numbers:
-    return raycast.numbers([*values, 0.0, 0.0, 0.0, 0.0, 0.0][:5])
+def _data(
+    kind: int,
+    params: Sequence[float],
+    z_m: tuple[float, float],
+    max_slope: float,
+    *,
+    step_m: float = 1.0,
+    profile_m: Array | None = None,
+    grid: Array | None = None,
+) -> SurfaceData:
+    """Pack a surface for the kernels; arrays that a kind does not use are empty."""
+    return SurfaceData(
+        kind,
+        raycast.numbers([*params, 0.0, 0.0, 0.0, 0.0, 0.0][:5]),
+        np.zeros((0, 2)) if profile_m is None else profile_m,
+        np.zeros((2, 2)) if grid is None else grid,
+        float(z_m[0]),
+        float(z_m[1]),
+        float(max_slope),
+        step_m,
+    )
 
 
 def _profile(name: str, vertices_m: list[tuple[float, float]]) -> ProfileSurface:
@@ -209,19 +218,8 @@ def _profile(name: str, vertices_m: list[tuple[float, float]]) -> ProfileSurface
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = float(np.nanmax(rise / run))
     z = vertices[:, 1]
-    return ProfileSurface(
-        name,
-        raycast.SurfaceData(
-            raycast.PROFILE,
-            _params(),
-            vertices,
-            _NO_GRID,
-            float(z.min()),
-            float(z.max()),
-            slope,
-            1.0,
-        ),
-    )
+    data = _data(raycast.PROFILE, (), (z.min(), z.max()), slope, profile_m=vertices)
+    return ProfileSurface(name, data)
 
 
 def flat() -> ProfileSurface:
@@ -230,22 +228,33 @@ def flat() -> ProfileSurface:
 
 
 def groove(included_angle_deg: float = 155.92, width_m: float = 6e-3) -> ProfileSurface:
-    """Return a V-groove along y in the plane z = 0; the paper's has 155.92 degrees (Table 2)."""
-    _check(
-        0.0 < included_angle_deg < 180.0, "included_angle_deg", included_angle_deg, "in (0, 180)"
-    )
+    """Return a V-groove along y in the plane z = 0.
+
+    Parameters
+    ----------
+    included_angle_deg : float
+        In (0, 180); the paper's groove has 155.92 (Table 2).
+    width_m : float
+        At the top.
+    """
+    angle = included_angle_deg
+    _check(0.0 < angle < 180.0, "included_angle_deg", angle, "in (0, 180)")
     _check(width_m > 0.0, "width_m", width_m, "positive")
-    depth = 0.5 * width_m / np.tan(np.deg2rad(0.5 * included_angle_deg))
+    depth = 0.5 * width_m / np.tan(np.deg2rad(0.5 * angle))
     return _profile("groove", [(-width_m / 2, 0.0), (0.0, -float(depth)), (width_m / 2, 0.0)])
 
 
 def steps(
     heights_m: Iterable[float] = (10e-6, 50e-6, 200e-6), width_m: float = 1.6e-3
 ) -> ProfileSurface:
-    """Return bars along y on the plane z = 0, with vertical walls; bars and gaps ``width_m`` wide.
+    """Return bars along y on the plane z = 0, with vertical walls.
 
-    Bar i spans ``((2 i - n + 1/2) width, (2 i - n + 3/2) width)`` of n; negative heights are
-    channels.
+    Parameters
+    ----------
+    heights_m : iterable of float
+        Of the bars from left to right; negative ones are channels.
+    width_m : float
+        Of bars and gaps: bar i of n spans ``((2 i - n + 1/2) width, (2 i - n + 3/2) width)``.
     """
     heights = [float(h) for h in heights_m]
     _check(len(heights) > 0 and all(np.isfinite(heights)), "heights_m", heights, "finite numbers")
@@ -258,14 +267,19 @@ def steps(
 
 
 def sphere_cap(radius_m: float = 50e-3, base_radius_m: float = 4e-3) -> SphereCap:
-    """Return a cap of the given sphere with the given foot circle on the plane z = 0."""
+    """Return a cap of a sphere on the plane z = 0.
+
+    Parameters
+    ----------
+    radius_m : float
+        Of the sphere.
+    base_radius_m : float
+        Of the cap's foot circle.
+    """
     _check(0.0 < base_radius_m < radius_m, "base_radius_m", base_radius_m, "in (0, radius_m)")
     down = float(np.sqrt(radius_m**2 - base_radius_m**2))
-    data = raycast.SurfaceData(
-        raycast.SPHERE, _params(radius_m, base_radius_m), _NO_PROFILE, _NO_GRID,
-        0.0, radius_m - down, base_radius_m / down, 1.0,
-    )  # fmt: skip
-    return SphereCap("sphere_cap", data)
+    params, slope = (radius_m, base_radius_m), base_radius_m / down
+    return SphereCap("sphere_cap", _data(raycast.SPHERE, params, (0.0, radius_m - down), slope))
 
 
 def hole_plate(
@@ -316,21 +330,23 @@ def hole_plate(
         radii[row, column] = radius
     if turned_over:
         radii = np.ascontiguousarray(radii[:, ::-1])
-    middle = ((columns - 1) / 2, (rows - 1) / 2)
-    data = raycast.SurfaceData(
-        raycast.HOLES, _params(pitch_m, chamfer_m, hole_albedo, *middle), _NO_PROFILE, radii,
-        -float(chamfer_m), 0.0, 1.0 if chamfer_m else 0.0, max(chamfer_m, 1e-6) / 4,
-    )  # fmt: skip
+    data = _data(
+        raycast.HOLES,
+        (pitch_m, chamfer_m, hole_albedo, (columns - 1) / 2, (rows - 1) / 2),
+        (-chamfer_m, 0.0),
+        1.0 if chamfer_m else 0.0,
+        step_m=max(chamfer_m, 1e-6) / 4,
+        grid=radii,
+    )
     return HolePlate("hole_plate", data)
 
 
 def _grid(name: str, heights_m: NDArray[np.floating], step_m: float) -> GridSurface:
     grid = np.ascontiguousarray(heights_m, dtype=np.float64)
     slope_y, slope_x = np.abs(np.diff(grid, axis=0)).max(), np.abs(np.diff(grid, axis=1)).max()
-    data = raycast.SurfaceData(
-        raycast.GRID, _params(step_m), _NO_PROFILE, grid, float(grid.min()), float(grid.max()),
-        float(np.hypot(slope_x, slope_y)) / step_m, step_m / 2,
-    )  # fmt: skip
+    slope = float(np.hypot(slope_x, slope_y)) / step_m
+    z = (grid.min(), grid.max())
+    data = _data(raycast.GRID, (step_m,), z, slope, step_m=step_m / 2, grid=grid)
     return GridSurface(name, data)
 
 
@@ -400,7 +416,14 @@ SURFACES: dict[str, Callable[..., Surface]] = {
 
 
 def make_surface(name: str, **params: object) -> Surface:
-    """Return a surface of the registry by name, with its factory's parameters.
+    """Return a surface of the registry.
+
+    Parameters
+    ----------
+    name : str
+        A key of `SURFACES`.
+    **params
+        Its factory's parameters.
 
     Raises
     ------

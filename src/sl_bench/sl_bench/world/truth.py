@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_bench.world import raycast
-from sl_bench.world.raycast import inlined
+from sl_bench.world.raycast import Vector, View, inlined
 from sl_common.kernel_cache import kernel
 
 Array = NDArray[np.float64]
@@ -18,61 +16,93 @@ DIFFERENCE_PX = 0.05
 
 
 @inlined
-def _look(surface: Any, camera: Any, qu: float, qv: float) -> Any:
+def _look(view: View, qu: float, qv: float) -> tuple[Vector, Vector, float]:
     """First hit ((x, y, z), (nx, ny, nz), depth) of a pixel's ray, part frame; inf for none."""
-    o, d = camera.position_m, raycast.ray(camera, qu, qv)
-    t, nx, ny, nz = raycast.first_hit(surface, (o[0], o[1], o[2]), d)
+    o, d = view.camera.position_m, raycast.ray(view.camera, qu, qv)
+    t, nx, ny, nz = raycast.first_hit(view.surface, (o[0], o[1], o[2]), d)
     return (o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]), (nx, ny, nz), t
 
 
 @kernel()
-def points(surface: Any, camera: Any, q_px: Any) -> Any:
-    """First intersections (N, 3), part frame, of the rays through pixels (N, 2); NaN for none."""
+def points(view: View, q_px: Array) -> Array:
+    """First intersections of camera rays with the part.
+
+    Parameters
+    ----------
+    view : View
+        Part and devices.
+    q_px : ndarray, (N, 2)
+        Camera pixels.
+
+    Returns
+    -------
+    ndarray, (N, 3)
+        Part frame; NaN where a ray meets nothing.
+    """
     out = np.full((q_px.shape[0], 3), np.nan)
     for i in range(q_px.shape[0]):
-        p, _, t = _look(surface, camera, q_px[i, 0], q_px[i, 1])
+        p, _, t = _look(view, q_px[i, 0], q_px[i, 1])
         if t < np.inf:
             out[i, 0], out[i, 1], out[i, 2] = p
     return out
 
 
 @kernel()
-def lit(surface: Any, camera: Any, projector: Any, q_px: Any) -> Any:
-    """Whether the projector lights what pixels (N, 2) see: inside the DMD and not in shadow."""
+def lit(view: View, q_px: Array) -> NDArray[np.bool_]:
+    """Whether the projector lights what pixels see: inside the DMD and not in shadow, (N,).
+
+    Parameters
+    ----------
+    view : View
+        Part and devices.
+    q_px : ndarray, (N, 2)
+        Camera pixels.
+    """
     out = np.zeros(q_px.shape[0], dtype=np.bool_)
-    o = projector.position_m
+    o, size = view.projector.position_m, view.projector.size_px
     for i in range(q_px.shape[0]):
-        p, n, t = _look(surface, camera, q_px[i, 0], q_px[i, 1])
+        p, n, t = _look(view, q_px[i, 0], q_px[i, 1])
         if not t < np.inf:
             continue
-        u, v, _ = raycast.project(projector, p[0], p[1], p[2])
-        inside = -0.5 <= u <= projector.size_px[0] - 0.5 and -0.5 <= v <= projector.size_px[1] - 0.5
+        u, v, _ = raycast.project(view.projector, p[0], p[1], p[2])
+        inside = -0.5 <= u <= size[0] - 0.5 and -0.5 <= v <= size[1] - 0.5
         facing = n[0] * (o[0] - p[0]) + n[1] * (o[1] - p[1]) + n[2] * (o[2] - p[2]) > 0.0
-        out[i] = inside and facing and not raycast.shadowed(surface, p, o)
+        out[i] = inside and facing and not raycast.shadowed(view.surface, p, o)
     return out
 
 
 @kernel()
-def projector_map(surface: Any, camera: Any, projector: Any, q_px: Any) -> Any:
-    """(u, v, projector depth, camera depth) (N, 4) of what pixels (N, 2) see, lit or not."""
+def projector_map(view: View, q_px: Array) -> Array:
+    """Where the projector sees what the camera sees, lit or not.
+
+    Parameters
+    ----------
+    view : View
+        Part and devices.
+    q_px : ndarray, (N, 2)
+        Camera pixels.
+
+    Returns
+    -------
+    ndarray, (N, 4)
+        u, v, projector depth, camera depth; NaN where a ray meets nothing.
+    """
     out = np.full((q_px.shape[0], 4), np.nan)
     for i in range(q_px.shape[0]):
-        p, _, t = _look(surface, camera, q_px[i, 0], q_px[i, 1])
+        p, _, t = _look(view, q_px[i, 0], q_px[i, 1])
         if t < np.inf:
-            u, v, depth = raycast.project(projector, p[0], p[1], p[2])
+            u, v, depth = raycast.project(view.projector, p[0], p[1], p[2])
             out[i, 0], out[i, 1], out[i, 2], out[i, 3] = u, v, depth, t
     return out
 
 
-def crossings(
-    scene: tuple[Any, Any, Any], axis: int, targets_px: Array, line_px: float, length_px: int
-) -> Array:
+def crossings(view: View, axis: int, targets_px: Array, line_px: float, length_px: int) -> Array:
     """Camera coordinates at which a DMD coordinate takes given values along a camera line.
 
     Parameters
     ----------
-    scene : tuple
-        Surface, camera and projector data.
+    view : View
+        Part and devices.
     axis : {0, 1}
         0: u along a camera row; 1: v along a camera column.
     targets_px : ndarray, (K,)
@@ -91,7 +121,7 @@ def crossings(
     def at(position: Array) -> Array:
         q = np.full((position.size, 2), float(line_px))
         q[:, axis] = position
-        return np.asarray(projector_map(*scene, q))[:, axis]
+        return projector_map(view, q)[:, axis]
 
     grid = np.arange(-1.0, length_px + 1.0)
     values = at(grid)
@@ -111,12 +141,22 @@ def crossings(
     return np.where(near, 0.5 * (low + high), np.nan)
 
 
-def gradients(scene: tuple[Any, Any, Any], axis: int, q_px: Array) -> Array:
-    """Gradient (N, 2) of u (axis 0) or v (1) over the camera's pixels, by central differences."""
+def gradients(view: View, axis: int, q_px: Array) -> Array:
+    """Gradient (N, 2) of a DMD coordinate over the camera's pixels, by central differences.
+
+    Parameters
+    ----------
+    view : View
+        Part and devices.
+    axis : {0, 1}
+        Of u, of v.
+    q_px : ndarray, (N, 2)
+        Camera pixels.
+    """
     out = np.empty_like(q_px)
     for k in (0, 1):
         step = np.zeros(2)
         step[k] = DIFFERENCE_PX
-        ahead, behind = projector_map(*scene, q_px + step), projector_map(*scene, q_px - step)
+        ahead, behind = projector_map(view, q_px + step), projector_map(view, q_px - step)
         out[:, k] = (ahead - behind)[:, axis] / (2.0 * DIFFERENCE_PX)
     return out

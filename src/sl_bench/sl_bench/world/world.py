@@ -67,7 +67,7 @@ class Scene:
 class Geometry:
     """Sample maps of a scene, and what the mirrors of each axis are blurred by."""
 
-    maps: tuple[Image, Image, Image, Image, Image]
+    maps: stripes.Samples
     levels: tuple[stripes.Levels, stripes.Levels]
     ambient: Image
 
@@ -228,7 +228,7 @@ class World:
         optics, electrons = self.optics, np.empty_like(lights[0][0])
         dtype = np.uint8 if optics.bits == 8 else np.uint16
         out: NDArray[np.uint8] | NDArray[np.uint16] = np.empty(electrons.shape, dtype=dtype)
-        sensor = (optics.dn_per_e, optics.read_noise_e, float(optics.max_dn))
+        sensor = photons.Sensor(optics.dn_per_e, optics.read_noise_e, float(optics.max_dn))
         key = np.uint64(photons.frame_key(np.uint64(optics.seed), np.uint64(frame_number)))
 
         def work(rows: tuple[int, int]) -> None:
@@ -248,20 +248,20 @@ class World:
     def _trace(self, scene: Scene) -> Geometry:
         light = shading.light_data(self.rig, self.optics, scene.finish)
         margin = self._weights.shape[1] // 2
-        parts = (*self._data(scene), light, margin)
+        view = self._view(scene)
         width, height = self.rig.camera.image_size
         shape = (2 * (height + 2 * margin), 2 * (width + 2 * margin))
         if self._maps is None:  # 31 MB each: fresh pages at every pose would cost a third of it
             self._maps = tuple(np.empty(shape, dtype=np.float32) for _ in range(6))
         maps = self._maps
-        in_strips(lambda r: shading.trace_rows(*parts, r, maps), shape[0])
+        in_strips(lambda r: shading.trace_rows(view, light, margin, r, maps), shape[0])
         u, v, lit, ambient, along_u, along_v = maps
         plain = np.empty((height, width), dtype=np.float32)
-        scale = np.float32(self.optics.white_e_per_s * self.optics.ambient)
-        in_strips(lambda r: stripes.render_plain(ambient, self._weights, scale, r, plain), height)
+        lens = self._lens(self.optics.ambient)
+        in_strips(lambda r: stripes.render_plain(ambient, lens, r, plain), height)
         in_strips(lambda r: shading.blur_rows(maps, r), shape[0])
         levels = (_levels(along_u, lit, self.optics), _levels(along_v, lit, self.optics))
-        return Geometry((u, v, lit, along_u, along_v), levels, plain)
+        return Geometry(stripes.Samples(u, v, lit, along_u, along_v), levels, plain)
 
     def _render(self, geometry: Geometry, on: NDArray[np.bool_]) -> Image:
         width, height = self.rig.camera.image_size
@@ -279,27 +279,31 @@ class World:
     def _render_lines(
         self, geometry: Geometry, axis: int, profile: NDArray[np.bool_], out: Image
     ) -> None:
-        u, v, lit, along_u, along_v = geometry.maps
-        maps = (u, v, lit, along_u, along_v) if axis == 0 else (v, u, lit, along_v, along_u)
-        levels = (geometry.levels[axis], geometry.levels[1 - axis])
-        across = self.rig.projector.image_size[1 - axis]
-        lines = (
+        maps, levels = geometry.maps, geometry.levels
+        if axis == 1:
+            u, v, lit, along_u, along_v = maps
+            maps, levels = stripes.Samples(v, u, lit, along_v, along_u), levels[::-1]
+        across, reach = self.rig.projector.image_size[1 - axis], levels[1].reach
+        pattern = stripes.Stripes(
             stripes.blurred_line(np.ascontiguousarray(profile), levels[0]),
             stripes.blurred_line(np.ones(across, dtype=np.bool_), levels[1]),
+            levels,
+            (reach - 0.5, across - reach - 0.5),
         )
-        safe = (levels[1].reach - 0.5, across - levels[1].reach - 0.5)
-        arguments = (maps, lines, levels, safe, self._weights, self._scale)
-        in_strips(lambda r: stripes.render_lines(*arguments, r, out), out.shape[0])
+        lens = self._lens()
+        in_strips(lambda r: stripes.render_lines(maps, pattern, lens, r, out), out.shape[0])
 
     def _render_mirrors(self, geometry: Geometry, on: NDArray[np.bool_], out: Image) -> None:
         ru, rv = (2 * levels.reach for levels in geometry.levels)
         mirrors = np.pad(on, ((rv, rv), (ru, ru))).astype(np.float32)
-        arguments = (geometry.maps, mirrors, geometry.levels, self._weights, self._scale)
-        in_strips(lambda r: stripes.render_mirrors(*arguments, r, out), out.shape[0])
+        image, lens = stripes.MirrorImage(mirrors, geometry.levels), self._lens()
+        in_strips(
+            lambda r: stripes.render_mirrors(geometry.maps, image, lens, r, out), out.shape[0]
+        )
 
-    @property
-    def _scale(self) -> np.float32:
-        return np.float32(self.optics.white_e_per_s)
+    def _lens(self, light: float = 1.0) -> stripes.Lens:
+        """From samples to electrons per second, at a brightness relative to white."""
+        return stripes.Lens(self._weights, np.float32(self.optics.white_e_per_s * light))
 
     # -- truth -----------------------------------------------------------------------------
 
@@ -309,13 +313,12 @@ class World:
         NaN where a ray meets nothing.
         """
         scene = self._scene
-        surface, camera, _ = self._data(scene)
-        part = truth.points(surface, camera, _pixels(q_px))
+        part = truth.points(self._view(scene), _pixels(q_px))
         return np.asarray(part @ scene.rotation.T + scene.translation_m)
 
     def truth_lit(self, q_px: Array) -> NDArray[np.bool_]:
         """Whether the projector lights what pixels (N, 2) see: inside the DMD, not in shadow."""
-        return np.asarray(truth.lit(*self._data(self._scene), _pixels(q_px)))
+        return truth.lit(self._view(self._scene), _pixels(q_px))
 
     def truth_edges(self, boundaries: Array, line_px: float, axis: Axis = "column") -> Array:
         """Camera u (K,) of DMD column boundaries along a camera row, or v of row boundaries.
@@ -338,11 +341,7 @@ class World:
         k = 0 if axis == "column" else 1
         targets = np.atleast_1d(np.asarray(boundaries, dtype=np.float64)) - 0.5
         length = self.rig.camera.image_size[k]
-        return truth.crossings(self._data(self._scene), k, targets, line_px, length)
-
-    def projector_px(self, points_m: Array) -> Array:
-        """DMD coordinates (..., 2) of world points (..., 3)."""
-        return self.rig.projector.project(points_m)
+        return truth.crossings(self._view(self._scene), k, targets, line_px, length)
 
     def edge_blur_px(self, q_px: Array, axis: Axis = "column") -> Array:
         """Standard deviation (N,) of a stripe's edge at pixels (N, 2), camera px.
@@ -353,8 +352,8 @@ class World:
         nothing.
         """
         k, q, o = 0 if axis == "column" else 1, _pixels(q_px), self.optics
-        scene = self._data(self._scene)
-        found, slope = np.asarray(truth.projector_map(*scene, q)), truth.gradients(scene, k, q)
+        view = self._view(self._scene)
+        found, slope = truth.projector_map(view, q), truth.gradients(view, k, q)
         focus_m = [d.translation_m[2] for d in (self.rig.projector, self.rig.camera)]
         off_focus = found[:, 2:] - focus_m
         projector2 = o.projector_blur_px**2 + (o.projector_defocus_px_per_m * off_focus[:, 0]) ** 2
@@ -363,15 +362,12 @@ class World:
         across = np.sqrt(lens2 + projector2 / steep2 + 1.0 / 12.0)
         return np.asarray(across * np.sqrt(steep2) / np.abs(slope[:, k]))
 
-    def _data(
-        self, scene: Scene
-    ) -> tuple[raycast.SurfaceData, raycast.DeviceData, raycast.DeviceData]:
+    def _view(self, scene: Scene) -> raycast.View:
         pose = (scene.rotation, scene.translation_m)
-        return (
-            scene.surface.data,
-            raycast.device_data(self.rig.camera, *pose),
-            raycast.device_data(self.rig.projector, *pose),
+        camera, projector = (
+            raycast.device_data(d, *pose) for d in (self.rig.camera, self.rig.projector)
         )
+        return raycast.View(scene.surface.data, camera, projector)
 
 
 def _finish(finish: Finish | str) -> Finish:
