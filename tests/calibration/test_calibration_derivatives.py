@@ -72,9 +72,9 @@ def test_the_whole_bundle(square: bool) -> None:
     """Both devices, three stage axes, positions and flat, at a state that is off the solution."""
     scene = Scene(Mounting(scale=(1.001, 1, 0.999), tilt_rad=(0.02, 0.03, 0.1)))
     stage = np.array([[0, 0, 0], [2e-4, 0, 1e-4], [0, 3e-4, 2e-4]])
-    holes, targets = scene.views(1, stage)
+    views = scene.views(1, stage)
     freedom = Freedom(StagePrior(0.01, 0.1, 1e-6), FlatPrior(), square)
-    problem = RigProblem(("camera", "projector"), Holes.of(holes), Targets.of(targets), freedom)
+    problem = RigProblem(("camera", "projector"), Holes.of(views), Targets.of(views), freedom)
     device = np.array([0.1, 1e-2, 1e-2, 1e-12, *[1e-6] * 3, *[1e-7] * 3])
     device = device if square else np.concatenate([device[:1], device])
     steps = np.array([*device, *device, *[1e-4] * 9, *[1e-7] * 9, 1e-7, 1e-5, 1e-5])

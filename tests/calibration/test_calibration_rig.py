@@ -36,8 +36,8 @@ FAULTY = Mounting(
 
 def joint(scene: Scene, seed: int, freedom: Freedom) -> Bundle:
     """Bundle from the truth, which is as good a start as any to the same minimum."""
-    holes, targets = scene.views(seed)
-    problem = RigProblem(("camera", "projector"), Holes.of(holes), Targets.of(targets), freedom)
+    views = scene.views(seed)
+    problem = RigProblem(("camera", "projector"), Holes.of(views), Targets.of(views), freedom)
     return solve_bundle(problem, problem.start(scene.rig.camera, scene.rig.projector))
 
 
@@ -137,11 +137,11 @@ def test_the_stage_is_found_out(solved: list[Bundle]) -> None:
 def worst() -> tuple[Solution, Scene, list[np.ndarray], list[np.ndarray]]:
     """The whole way, with every fault of the issue at once."""
     scene = Scene(FAULTY, hole_noise_px=0.02, targets=(20, 15))
-    holes, targets = scene.views(11)
+    views = scene.views(11)
     rng = np.random.default_rng(12)
-    bad_holes = [spoil(view.pixels, 0.05, 0.5, rng) for view in holes]
-    bad_targets = [spoil(view.projector_px, 0.05, 4.0, rng) for view in targets]
-    return solve_rig(holes, targets, SENSORS), scene, bad_holes, bad_targets
+    bad_holes = [spoil(view.centres_px, 0.05, 0.5, rng) for view in views]
+    bad_targets = [spoil(view.dmd_px, 0.05, 4.0, rng) for view in views]
+    return solve_rig(views, SENSORS), scene, bad_holes, bad_targets
 
 
 def test_wrong_points_are_left_out(worst) -> None:  # type: ignore[no-untyped-def]
@@ -173,10 +173,10 @@ def test_however_the_plate_lies(seed: int) -> None:
     a, b, c = rng.normal(0, 0.01, 3)
     mounting = Mounting((1, 1, rng.normal(1, 0.005)), (a, b, c), (x, y, rng.uniform(-0.8, 0.8)))
     scene = Scene(mounting, hole_noise_px=0.02)
-    holes, targets = scene.views(seed)
-    for view in holes:
-        spoil(view.pixels, 0.05, rng.choice([0.3, 3, 30]), rng)
-    errors = point_errors(solve_rig(holes, targets, SENSORS).bundle, scene)
+    views = scene.views(seed)
+    for view in views:
+        spoil(view.centres_px, 0.05, rng.choice([0.3, 3, 30]), rng)
+    errors = point_errors(solve_rig(views, SENSORS).bundle, scene)
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 1.0e-6
 
 
@@ -212,23 +212,23 @@ def test_a_height_left_out_is_predicted_to_the_noise(worst) -> None:  # type: ig
 
 def test_one_step_is_the_solution_without_the_height() -> None:
     scene = Scene(FAULTY)
-    holes, targets = scene.views(13)
+    views = scene.views(13)
     bundle = joint(scene, 13, Freedom())
     problem = RigProblem(
-        ("camera", "projector"), Holes.of(holes[1:]), Targets.of(targets[1:]), Freedom()
+        ("camera", "projector"), Holes.of(views[1:]), Targets.of(views[1:]), Freedom()
     )
     without = solve_bundle(problem, problem.start(scene.rig.camera, scene.rig.projector))
-    first = scene.axes @ holes[0].stage_m + np.pad(holes[0].plate_xy_m, ((0, 0), (0, 1)))
-    moved = first + (without.state.axes - scene.axes) @ holes[0].stage_m
-    off = without.state.devices[0].project(moved) - holes[0].pixels
+    first = scene.axes @ views[0].place + np.pad(views[0].plate_xy_m, ((0, 0), (0, 1)))
+    moved = first + (without.state.axes - scene.axes) @ views[0].place
+    off = without.state.devices[0].project(moved) - views[0].centres_px
     found = leave_heights_out(bundle)[0]
     assert found.hole_rms_px == pytest.approx(np.sqrt(np.mean(np.sum(off**2, axis=1))), rel=1e-3)
 
 
 def test_two_heights_leave_no_check() -> None:
     scene = Scene()
-    holes, targets = scene.views(14, np.array([[0, 0, -1e-3], [0, 0, 1e-3]]))
-    solution = solve_rig(holes, targets, SENSORS)
+    views = scene.views(14, np.array([[0, 0, -1e-3], [0, 0, 1e-3]]))
+    solution = solve_rig(views, SENSORS)
     assert solution.left_out == ()
     reasons = judge(solution.figures, Limits()).reasons
     assert [reason.split()[0] for reason in reasons] == ["left_out_z_m"]
@@ -240,7 +240,7 @@ def test_a_camera_alone_says_what_it_does_not_know() -> None:
     The truth is within 4 of its own sigmas whatever is assumed; alone, the camera knows the
     scale of z travel at least twice worse than both devices together.
     """
-    holes, _ = Scene().views(15)
+    holes = Holes.of(Scene().views(15))
     true = Scene().rig.camera
     free = solve_camera(holes, CAMERA)
     held = solve_camera(holes, CAMERA, Freedom(FAULTLESS))
@@ -258,8 +258,8 @@ def test_a_camera_alone_says_what_it_does_not_know() -> None:
 def test_squareness_is_told_from_tilt_when_x_and_y_move() -> None:
     scene = Scene(Mounting((1.0005, 0.9995, 1.001), (0.001, 0.0035, -0.002), (0.02, 0.03, 0.05)))
     places = np.array([[0, 0, -1], [0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0.0]]) * 1e-3
-    holes, targets = scene.views(16, places)
-    report = solve_rig(holes, targets, SENSORS).bundle.stage
+    views = scene.views(16, places)
+    report = solve_rig(views, SENSORS).bundle.stage
     true = scene.mounting.axes / np.linalg.norm(scene.mounting.axes, axis=0)
     angles = np.arcsin([true[:, 0] @ true[:, 1], true[:, 0] @ true[:, 2], true[:, 1] @ true[:, 2]])
     assert (np.abs(report.squareness_rad - angles) < 4 * report.squareness_sigma_rad).all()
@@ -290,12 +290,11 @@ def test_a_stage_that_does_not_repeat() -> None:
     rng = np.random.default_rng(18)
     told = np.array([[0, 0, z] for z in HEIGHTS_M])
     real = told + 1e-6 * rng.standard_normal(told.shape)
-    holes, targets = scene.views(18, real)
-    holes = [replace(view, stage_m=s) for view, s in zip(holes, told, strict=True)]
-    targets = [replace(view, stage_m=s) for view, s in zip(targets, told, strict=True)]
-    trusted = solve_rig(holes, targets, SENSORS).bundle
+    views = scene.views(18, real)
+    views = [replace(view, height_m=z) for view, z in zip(views, HEIGHTS_M, strict=True)]
+    trusted = solve_rig(views, SENSORS).bundle
     loose = Freedom(StagePrior(position_sigma_m=1e-6))
-    known = solve_rig(holes, targets, SENSORS, loose).bundle
+    known = solve_rig(views, SENSORS, loose).bundle
     assert trusted.scales[0] > 2
     assert known.scales.max() < 1.1
     errors = known.state.errors_m - (real - told)
@@ -349,7 +348,7 @@ def test_pixel_size_on_the_part() -> None:
 
 
 def test_too_many_targets_are_thinned_the_same_way_each_time() -> None:
-    view = Scene(targets=(40, 30)).views(20)[1][0]
+    view = Scene(targets=(40, 30)).views(20)[0]
     few = thinned(view, 100)
     assert len(few.camera_px) == 100
     np.testing.assert_array_equal(few.camera_px, thinned(view, 100).camera_px)

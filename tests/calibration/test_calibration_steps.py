@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sl_calibration.bundle.outlier_rejection import fits_homography
-from sl_calibration.data.solver_input import HoleView, TargetView
+from sl_calibration.data.observations import View
+from sl_calibration.data.solver_input import Holes, Targets
 from sl_calibration.solve.image_centre_search import search_centre
 from sl_calibration.solve.linear_step import Sensor, cost_px2, linear_step
 from sl_calibration.solve.solution_pipeline import solve_rig
@@ -84,10 +87,14 @@ def test_screen_finds_gross_errors_and_spares_the_lens() -> None:
     np.testing.assert_array_equal(fits_homography(WORLD_M[:, :2], pixels, view), ~bad)
 
 
-def views(heights_m: list[float], holes: int = 100, noise_px: float = 0.01) -> list[HoleView]:
-    made = Scene(hole_noise_px=noise_px).views(5, np.array([[0, 0, z] for z in heights_m]))[0]
-    return [HoleView(v.stage_m, v.plate_xy_m[:holes], v.pixels[:holes], v.sigma_px[0, 0])
-            for v in made]  # fmt: skip
+def views(heights_m: list[float], holes: int = 100, noise_px: float = 0.01) -> list[View]:
+    made = Scene(hole_noise_px=noise_px).views(5, np.array([[0, 0, z] for z in heights_m]))
+    return [of_holes(view, slice(holes)) for view in made]
+
+
+def of_holes(view: View, which: slice) -> View:
+    names = ("hole_ids", "plate_xy_m", "centres_px", "centres_sigma_px")
+    return replace(view, **{name: getattr(view, name)[which] for name in names})
 
 
 @pytest.mark.parametrize(
@@ -104,67 +111,63 @@ def views(heights_m: list[float], holes: int = 100, noise_px: float = 0.01) -> l
     ],
     ids=["none", "one height", "one height thrice", "few holes", "heights too close"],
 )
-def test_degenerate_views_are_refused(seen: list[HoleView], message: str) -> None:
+def test_degenerate_views_are_refused(seen: list[View], message: str) -> None:
     with pytest.raises(CalibrationError, match=message):
-        solve_camera(seen, CAMERA)
+        solve_camera(Holes.of(seen), CAMERA)
 
 
 def test_holes_in_one_line_are_refused() -> None:
-    line = [
-        HoleView(v.stage_m, v.plate_xy_m[40:60:1][:20] * [1, 0], v.pixels[40:60], 0.01)
-        for v in views([-1e-3, 0.0, 1e-3])
-    ]
+    line = [of_holes(view, slice(40, 60)) for view in views([-1e-3, 0.0, 1e-3])]
+    line = [replace(view, plate_xy_m=view.plate_xy_m * [1, 0]) for view in line]
     with pytest.raises(CalibrationError):
-        solve_camera(line, CAMERA)
+        solve_camera(Holes.of(line), CAMERA)
 
 
 def test_a_plate_turned_over_is_refused() -> None:
     """From behind, x is mirrored: only a camera below the plate could see that."""
-    mirrored = [
-        HoleView(v.stage_m, v.plate_xy_m * [-1, 1], v.pixels, 0.01)
-        for v in views([-1e-3, 0.0, 1e-3])
-    ]
+    seen = views([-1e-3, 0.0, 1e-3])
+    mirrored = [replace(view, plate_xy_m=view.plate_xy_m * [-1, 1]) for view in seen]
     with pytest.raises(CalibrationError, match=r"turned over|signs right"):
-        solve_camera(mirrored, CAMERA)
+        solve_camera(Holes.of(mirrored), CAMERA)
 
 
 def test_heights_of_the_wrong_sign_are_refused() -> None:
-    flipped = [
-        HoleView(-v.stage_m, v.plate_xy_m, v.pixels, 0.01) for v in views([-1e-3, 0.0, 1e-3])
-    ]
+    flipped = [replace(view, height_m=-view.height_m) for view in views([-1e-3, 0.0, 1e-3])]
     with pytest.raises(CalibrationError):
-        solve_camera(flipped, CAMERA)
+        solve_camera(Holes.of(flipped), CAMERA)
 
 
 def test_a_projector_seen_at_one_height_is_refused() -> None:
-    _, targets = Scene().views(6, np.zeros((1, 3)))
+    targets = Targets.of(Scene().views(6, np.zeros((1, 3))))
     with pytest.raises(CalibrationError, match="projected targets at one height only"):
         solve_projector(targets, RIG.camera, np.eye(3), PROJECTOR)
 
 
 def test_a_rig_without_targets_is_refused() -> None:
-    holes, _ = Scene().views(6)
+    none = dict.fromkeys(("camera_px", "dmd_px", "dmd_sigma_px"), np.empty((0, 2)))
+    holes = [replace(view, **none) for view in Scene().views(6)]
     with pytest.raises(CalibrationError, match="projected targets"):
-        solve_rig(holes, [], SENSORS)
+        solve_rig(holes, SENSORS)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"stage_m": [0.0, 0.0]}, r"stage_m.shape=\(2,\); expected \(3,\)"),
-        ({"pixels": np.zeros((4, 2))}, r"pixels.shape=\(4, 2\); expected \(5, 2\)"),
-        ({"pixels": np.full((5, 2), np.nan)}, "not finite"),
-        ({"sigma_px": 0.0}, "not positive"),
-        ({"sigma_px": np.ones(4)}, "sigma_px.shape"),
+        ({"xy_m": [0.0]}, r"xy_m.shape=\(1,\); expected \(2,\)"),
+        ({"plate_xy_m": np.zeros((4, 2))}, r"plate_xy_m.shape=\(4, 2\); expected \(100, 2\)"),
+        ({"centres_px": np.full((100, 2), np.nan)}, "not finite"),
+        ({"centres_sigma_px": np.zeros(100)}, "not positive"),
+        ({"centres_sigma_px": np.ones(4)}, "sigma_px.shape"),
+        ({"dmd_sigma_px": np.ones(108)}, r"dmd_sigma_px.shape=\(108,\); expected \(108, 2\)"),
     ],
 )
 def test_broken_observations_are_refused(change: dict[str, object], message: str) -> None:
-    fields = {"stage_m": np.zeros(3), "plate_xy_m": np.zeros((5, 2)), "pixels": np.zeros((5, 2)),
-              "sigma_px": 0.01}  # fmt: skip
     with pytest.raises(CalibrationError, match=message):
-        HoleView(**{**fields, **change})  # type: ignore[arg-type]
+        replace(Scene().views(6)[0], **change)  # type: ignore[arg-type]
 
 
 def test_targets_have_a_sigma_for_each_coordinate() -> None:
-    view = TargetView(np.zeros(3), np.zeros((3, 2)), np.zeros((3, 2)), np.array([[1, 2]] * 3))
-    np.testing.assert_array_equal(view.sigma_px, [[1, 2]] * 3)
+    view = Scene().views(6)[0]
+    sigma_px = np.array([[1.0, 2.0]] * len(view.dmd_px))
+    joined = Targets.of([replace(view, dmd_sigma_px=sigma_px)])
+    np.testing.assert_array_equal(joined.sigma_px, sigma_px)

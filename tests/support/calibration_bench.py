@@ -80,14 +80,10 @@ def look_with(
     def look(stack: Stack, request: CalibrationRequest) -> View:
         height_m = stack.place[2] if rig.plate_m is None else rig.plate_m
         stage_m = np.array([*stack.place[:2], height_m])
-        holes, thrown = scene.holes(rng, stage_m), scene.thrown(rng, stage_m)
-        ids = np.stack(np.meshgrid(range(10), range(10)), axis=-1).reshape(-1, 2)
+        view = scene.view(stage_m, scene.holes(rng, stage_m), scene.thrown(rng, stage_m))
         few = slice(None) if request.patterns else slice(0)
-        return View(
-            stack.place[2], ids, holes.plate_xy_m, holes.pixels, holes.sigma_px[:, 0],
-            thrown.camera_px[few], thrown.projector_px[few], thrown.sigma_px[few], 0.02,
-            stack.place[:2],
-        )  # fmt: skip
+        parts = {n: getattr(view, n)[few] for n in ("camera_px", "dmd_px", "dmd_sigma_px")}
+        return replace(view, height_m=stack.place[2], **parts)
 
     return look
 

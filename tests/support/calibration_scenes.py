@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sl_bench.world.mounting import Mounting
 from sl_bench.world.reference_rig import reference_rig
-from sl_calibration.data.solver_input import HoleView, TargetView
+from sl_calibration.data.observations import View
 from sl_calibration.solve.linear_step import Sensor
 from sl_reconstruct.model.rig import Device, Rig
 
@@ -29,6 +29,7 @@ def grid(width_m: float, height_m: float, columns: int, rows: int) -> Array:
 
 
 PLATE_XY_M = grid(10e-3, 8e-3, 10, 10)
+HOLE_IDS = np.stack(np.meshgrid(range(10), range(10)), axis=-1).reshape(-1, 2)
 
 
 @dataclass(frozen=True)
@@ -59,31 +60,44 @@ class Scene:
             device.rotation @ offset + device.translation_m, device.lens,
         )  # fmt: skip
 
-    def holes(self, rng: np.random.Generator, stage_m: Array) -> HoleView:
+    def holes(self, rng: np.random.Generator, stage_m: Array) -> Array:
+        """Images (100, 2) of the plate's holes."""
         points = np.pad(PLATE_XY_M, ((0, 0), (0, 1))) + self.axes @ stage_m
         noise = self.hole_noise_px * rng.standard_normal((len(points), 2))
-        pixels = self.rig.camera.project(points) + noise
-        return HoleView(stage_m, PLATE_XY_M, pixels, max(self.hole_noise_px, 1e-6))
+        return self.rig.camera.project(points) + noise
 
-    def thrown(self, rng: np.random.Generator, stage_m: Array) -> TargetView:
+    def thrown(self, rng: np.random.Generator, stage_m: Array) -> tuple[Array, Array]:
+        """Camera pixels (N, 2) of targets, and their DMD coordinates (N, 2)."""
         offset, slope_x, slope_y = self.flat
         xy = grid(11e-3, 8.5e-3, *self.targets)
         height = offset + xy @ [slope_x, slope_y]
         points = np.column_stack([xy, height]) + self.axes @ stage_m
         noise = self.target_noise_px * rng.standard_normal(xy.shape)
-        return TargetView(
-            stage_m, self.rig.camera.project(points), self.rig.projector.project(points) + noise,
-            max(self.target_noise_px, 1e-6),
-        )  # fmt: skip
+        return self.rig.camera.project(points), self.rig.projector.project(points) + noise
 
-    def views(
-        self, seed: int, stage_m: Array | None = None
-    ) -> tuple[list[HoleView], list[TargetView]]:
+    def view(self, stage_m: Array, holes_px: Array, thrown: tuple[Array, Array]) -> View:
+        """Make a view of what `holes` and `thrown` gave."""
+        camera_px, dmd_px = thrown
+        return View(
+            float(stage_m[2]),
+            HOLE_IDS,
+            PLATE_XY_M,
+            holes_px,
+            np.full(len(holes_px), max(self.hole_noise_px, 1e-6)),
+            camera_px,
+            dmd_px,
+            np.full(dmd_px.shape, max(self.target_noise_px, 1e-6)),
+            edge_sigma_px=0.02,
+            xy_m=(float(stage_m[0]), float(stage_m[1])),
+        )
+
+    def views(self, seed: int, stage_m: Array | None = None) -> list[View]:
         rng = np.random.default_rng(seed)
         if stage_m is None:
             stage_m = np.column_stack([np.zeros((5, 2)), HEIGHTS_M])
         holes = [self.holes(rng, s) for s in stage_m]
-        return holes, [self.thrown(rng, s) for s in stage_m]
+        thrown = [self.thrown(rng, s) for s in stage_m]
+        return [self.view(*view) for view in zip(stage_m, holes, thrown, strict=True)]
 
 
 def spoil(pixels: Array, part: float, size_px: float, rng: np.random.Generator) -> Array:

@@ -7,7 +7,7 @@ that the stage told.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -48,11 +48,16 @@ class View:
     dmd_px : ndarray, (M, 2)
         DMD column and row that light them.
     dmd_sigma_px : ndarray, (M, 2)
-        Their 1-sigma.
+        Their 1-sigma, the camera's noise included.
     edge_sigma_px : float
         1-sigma of a single edge on this plate in this light, camera pixels.
     xy_m : tuple of float
         Stage x and y, as the stage tells them, metres.
+
+    Raises
+    ------
+    CalibrationError
+        When shapes do not fit, or a number is not finite (``edge_sigma_px`` may be NaN).
     """
 
     height_m: float
@@ -66,10 +71,36 @@ class View:
     edge_sigma_px: float = float("nan")
     xy_m: tuple[float, float] = (0.0, 0.0)
 
+    def __post_init__(self) -> None:
+        holes, targets = len(self.centres_px), len(self.camera_px)
+        shapes = {"height_m": (), "hole_ids": (holes, 2), "xy_m": (2,)}
+        shapes |= {"plate_xy_m": (holes, 2), "centres_px": (holes, 2), "centres_sigma_px": (holes,)}
+        shapes |= dict.fromkeys(("camera_px", "dmd_px", "dmd_sigma_px"), (targets, 2))
+        for name, shape in shapes.items():
+            value = np.asarray(getattr(self, name))
+            if value.shape != shape:
+                raise CalibrationError(f"{name}.shape={value.shape}; expected {shape}")
+            if not np.all(np.isfinite(value)):
+                raise CalibrationError(f"{name} holds a number that is not finite")
+            if "sigma" in name and not np.all(value > 0):
+                raise CalibrationError(f"{name} holds numbers that are not positive")
+
     @property
     def place(self) -> tuple[float, float, float]:
         """Where the stage stood, metres."""
         return (*self.xy_m, self.height_m)
+
+
+def stage_positions(views: Sequence[View]) -> Array:
+    """Stage position (V, 3) of each view: z as it reads, x and y from where most views stood.
+
+    A stage whose x and y only tremble has not moved in them.
+    """
+    places = np.array([view.place for view in views]).reshape(-1, 3)
+    if len(places):
+        places[:, :2] -= np.median(places[:, :2], axis=0)
+    places[:, :2][np.abs(places[:, :2]) < SAME_XY_M] = 0.0
+    return places
 
 
 @dataclass(frozen=True)
@@ -96,29 +127,26 @@ class Observations:
     made_from: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def stage_m(self) -> list[Array]:
-        """Stage position (3,) of each view: z as it reads, x and y from where most views stood.
-
-        A stage whose x and y only tremble has not moved in them.
-        """
-        xy = np.array([view.xy_m for view in self.views])
-        aside = xy - np.median(xy, axis=0)
-        aside[np.abs(aside) < SAME_XY_M] = 0.0
-        return [np.array([*a, v.height_m]) for a, v in zip(aside, self.views, strict=True)]
+    def stage_m(self) -> Array:
+        """Stage position (V, 3) of each view."""
+        return stage_positions(self.views)
 
     @property
-    def holes(self) -> int:
-        """Holes of all views."""
-        return sum(len(view.hole_ids) for view in self.views)
-
-    @property
-    def targets(self) -> int:
-        """Projector targets of all views."""
-        return sum(len(view.camera_px) for view in self.views)
+    def has_targets(self) -> bool:
+        """Whether the projector was seen in any view."""
+        return any(len(view.camera_px) for view in self.views)
 
 
 def save_observations(path: Path, observations: Observations) -> None:
-    """Write a ``.npz`` in one step: arrays ``NAME_i`` of view i, and the rest as JSON ``about``."""
+    """Write observations in one step.
+
+    Parameters
+    ----------
+    path : Path
+        A ``.npz``: arrays ``NAME_i`` of view i, and the rest as JSON ``about``.
+    observations : Observations
+        What is written.
+    """
     about = {
         "format": FORMAT,
         "views": len(observations.views),
@@ -142,20 +170,17 @@ def load_observations(path: Path) -> Observations:
     CalibrationError
         When the file is not one, or incomplete.
     """
-    names = View.__dataclass_fields__
     try:
         with path.open("rb") as whole, np.load(whole, allow_pickle=False) as file:
             about = json.loads(str(file["about"]))
-            _check_format(about, path)
-            views = [
-                {n: file[f"{n}_{i}"] for n in names if n != "xy_m" or f"{n}_{i}" in file}
-                for i in range(int(about["views"]))
-            ]
-        made = [_view(values) for values in views]
-        return Observations(
-            tuple(made), _size(about["camera_size"]), _size(about["dmd_size"]),
-            float(about["camera_pitch_m"]), float(about["dmd_pitch_m"]), about["made_from"],
-        )  # fmt: skip
+            if about.get("format") != FORMAT:
+                raise CalibrationError(
+                    f"{path} is of format {about.get('format')}; expected format {FORMAT}"
+                )
+            views = tuple(_view(file, i) for i in range(int(about["views"])))
+        camera_size, dmd_size = _size(about["camera_size"]), _size(about["dmd_size"])
+        pitches = float(about["camera_pitch_m"]), float(about["dmd_pitch_m"])
+        return Observations(views, camera_size, dmd_size, *pitches, about["made_from"])
     except CalibrationError:
         raise
     except (OSError, KeyError, ValueError, TypeError, EOFError, BadZipFile, ZlibError) as error:
@@ -164,20 +189,15 @@ def load_observations(path: Path) -> Observations:
         ) from error
 
 
-def _view(values: dict[str, Any]) -> View:
-    """View of its arrays; older files have no x and y."""
+def _view(file: Mapping[str, Any], i: int) -> View:
+    """View i of a file; older files have no x and y."""
+    names = [name for name in View.__dataclass_fields__ if name != "xy_m" or f"{name}_{i}" in file]
+    values = {name: file[f"{name}_{i}"] for name in names}
     x, y = values.get("xy_m", (0.0, 0.0))
     numbers = {name: float(values[name]) for name in ("height_m", "edge_sigma_px")}
     return View(**{**values, **numbers, "xy_m": (float(x), float(y))})
 
 
-def _check_format(about: Mapping[str, Any], path: Path) -> None:
-    if about.get("format") != FORMAT:
-        raise CalibrationError(
-            f"{path} is of format {about.get('format')}; expected format {FORMAT}"
-        )
-
-
 def _size(value: Any) -> tuple[int, int]:
-    width, height = value
-    return int(width), int(height)
+    width, height = map(int, value)
+    return width, height

@@ -57,9 +57,16 @@ def observe(stack: Stack, order: CalibrationRequest) -> View:
     good = holes.good
     return View(
         stack.place[2],
-        holes.ids[good], holes.plate_xy_m[good], holes.centres_px[good], holes.sigma_px[good],
-        targets.camera_px, targets.dmd_px, targets.sigma_px, targets.edge_sigma_px, stack.place[:2],
-    )  # fmt: skip
+        hole_ids=holes.ids[good],
+        plate_xy_m=holes.plate_xy_m[good],
+        centres_px=holes.centres_px[good],
+        centres_sigma_px=holes.sigma_px[good],
+        camera_px=targets.camera_px,
+        dmd_px=targets.dmd_px,
+        dmd_sigma_px=targets.sigma_px,
+        edge_sigma_px=targets.edge_sigma_px,
+        xy_m=stack.place[:2],
+    )
 
 
 def _targets(stack: Stack, white: NDArray[np.float32]) -> Correspondences:

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from sl_calibration.bundle.parameters import FixedLens, FlatPrior, Freedom
-from sl_calibration.data.observations import Observations
-from sl_calibration.data.solver_input import HoleView, TargetView, hole_views, target_views
+from sl_calibration.data.observations import Observations, View
+from sl_calibration.data.solver_input import Holes, Targets
 from sl_calibration.solve.acceptance import Limits, judge
 from sl_calibration.solve.cross_validation import leave_heights_out
 from sl_calibration.solve.fixed_intrinsics import solve_with_fixed_lens
@@ -45,12 +45,8 @@ def solve(observations: Observations, limits: Limits) -> JudgedSolution:
     """
     began_s = time.perf_counter()
     projector = Sensor(observations.dmd_size, observations.dmd_pitch_m)
-    solution = solve_rig(
-        hole_views(observations),
-        target_views(observations),
-        (_camera(observations), projector),
-        _freedom(observations.made_from),
-    )
+    sensors = _camera(observations), projector
+    solution = solve_rig(observations.views, sensors, _freedom(observations.made_from))
     figures = {}
     if plain := observations.made_from.get("kept"):
         lens = FixedLens.of_plain(plain)
@@ -77,7 +73,7 @@ def solve_camera_alone(observations: Observations, limits: Limits) -> JudgedSolu
     """
     began_s = time.perf_counter()
     freedom = _freedom(observations.made_from)
-    camera = solve_camera(hole_views(observations), _camera(observations), freedom)
+    camera = solve_camera(Holes.of(observations.views), _camera(observations), freedom)
     solution = Solution(camera, None, camera.bundle)
     verdict = judge(solution.figures, limits)
     return JudgedSolution(observations, solution, verdict, limits, time.perf_counter() - began_s)
@@ -94,16 +90,13 @@ def _freedom(made_from: Mapping[str, Any]) -> Freedom:
 
 
 def solve_rig(
-    holes: Sequence[HoleView],
-    targets: Sequence[TargetView],
-    sensors: tuple[Sensor, Sensor],
-    freedom: Freedom | None = None,
+    views: Sequence[View], sensors: tuple[Sensor, Sensor], freedom: Freedom | None = None
 ) -> Solution:
     """Calibrate a rig.
 
     Parameters
     ----------
-    holes, targets : sequence
+    views : sequence of View
         The plate seen by the camera, and the patterns on it, at three or more heights (two leave
         no check).
     sensors : tuple of Sensor
@@ -117,20 +110,20 @@ def solve_rig(
         When the views are degenerate, with what is missing, or nothing fits them.
     """
     freedom = freedom or Freedom()
-    few = [thinned(view) for view in targets]
+    holes, targets = Holes.of(views), Targets.of([thinned(view) for view in views])
     camera = solve_camera(holes, sensors[0], freedom)
     axes = camera.bundle.state.axes
-    projector = solve_projector(few, camera.device, axes, sensors[1], freedom.square_pixels)
-    joint = solve_joint(holes, few, camera, projector, freedom)
+    projector = solve_projector(targets, camera.device, axes, sensors[1], freedom.square_pixels)
+    joint = solve_joint(holes, targets, camera, projector, freedom)
     return Solution(camera, projector, joint, leave_heights_out(joint))
 
 
-def thinned(view: TargetView, most: int = MAX_TARGETS) -> TargetView:
+def thinned(view: View, most: int = MAX_TARGETS) -> View:
     """Draw some targets of a view, evenly, always the same ones.
 
     Parameters
     ----------
-    view : TargetView
+    view : View
         Returned as it is where it has few enough.
     most : int
         Number of targets to keep.
@@ -139,6 +132,5 @@ def thinned(view: TargetView, most: int = MAX_TARGETS) -> TargetView:
     if count <= most:
         return view
     rows = np.sort(np.random.default_rng(0).choice(count, most, replace=False))
-    return TargetView(
-        view.stage_m, view.camera_px[rows], view.projector_px[rows], view.sigma_px[rows]
-    )
+    names = ("camera_px", "dmd_px", "dmd_sigma_px")
+    return replace(view, **{name: getattr(view, name)[rows] for name in names})

@@ -7,7 +7,6 @@ both refined together, with one covariance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +17,7 @@ from sl_calibration.bundle.derivatives import meet
 from sl_calibration.bundle.outlier_rejection import fits_homography
 from sl_calibration.bundle.parameters import Freedom
 from sl_calibration.bundle.stage_model import FAULTLESS
-from sl_calibration.data.solver_input import Holes, HoleView, Targets, TargetView
+from sl_calibration.data.solver_input import Holes, Targets
 from sl_calibration.solve.image_centre_search import CentreSearch, search_centre
 from sl_calibration.solve.linear_step import Sensor
 from sl_calibration.solve.observability import check_solution, check_views
@@ -52,14 +51,12 @@ class DeviceSolution:
         return self.bundle.state.devices[0]
 
 
-def solve_camera(
-    views: Sequence[HoleView], sensor: Sensor, freedom: Freedom | None = None
-) -> DeviceSolution:
+def solve_camera(holes: Holes, sensor: Sensor, freedom: Freedom | None = None) -> DeviceSolution:
     """Calibrate a camera.
 
     Parameters
     ----------
-    views : sequence of HoleView
+    holes : Holes
         The plate at two or more heights; five over the depth of the volume are good.
     sensor : Sensor
         Image size and pixel pitch.
@@ -78,7 +75,6 @@ def solve_camera(
     CalibrationError
         When the views are degenerate, or nothing fits them.
     """
-    holes = Holes.of(views)
     good = _prefiltered(holes.points_m[:, :2], holes, "holes")
     problem = RigProblem(("camera",), holes, Targets.of([]), freedom or Freedom())
     bundle = solve_from_many_starts(problem, good, sensor)
@@ -97,17 +93,13 @@ def _prefiltered(plane: Array, data: Holes | Targets, what: str) -> NDArray[np.b
 
 
 def solve_projector(
-    views: Sequence[TargetView],
-    camera: Device,
-    axes: Array,
-    sensor: Sensor,
-    square_pixels: bool = True,
+    targets: Targets, camera: Device, axes: Array, sensor: Sensor, square_pixels: bool = True
 ) -> DeviceSolution:
     """Calibrate a projector with a calibrated camera: the paper's two steps, then the bundle.
 
     Parameters
     ----------
-    views : sequence of TargetView
+    targets : Targets
         DMD coordinates on a flat at two or more heights.
     camera : Device
         The calibrated camera.
@@ -128,7 +120,6 @@ def solve_projector(
     CalibrationError
         When the views are degenerate, or nothing fits them.
     """
-    targets = Targets.of(views)
     good = _prefiltered(targets.camera_px, targets, "projected targets")
     # where the rays meet the plate's plane; the joint solution finds where the flat is another
     heights = (targets.stage_m @ axes.T)[:, 2]
@@ -147,8 +138,8 @@ def solve_projector(
 
 
 def solve_joint(
-    holes: Sequence[HoleView],
-    targets: Sequence[TargetView],
+    holes: Holes,
+    targets: Targets,
     camera: DeviceSolution,
     projector: DeviceSolution,
     freedom: Freedom | None = None,
@@ -157,7 +148,7 @@ def solve_joint(
 
     Parameters
     ----------
-    holes, targets : sequence
+    holes, targets : Holes, Targets
         All views.
     camera, projector : DeviceSolution
         Where to start.
@@ -174,9 +165,7 @@ def solve_joint(
     CalibrationError
         When the views do not determine the parameters.
     """
-    problem = RigProblem(
-        ("camera", "projector"), Holes.of(holes), Targets.of(targets), freedom or Freedom()
-    )
+    problem = RigProblem(("camera", "projector"), holes, targets, freedom or Freedom())
     start = problem.start(camera.device, projector.device)
     bundle = solve_bundle(problem, start._replace(axes=camera.bundle.state.axes))
     check_solution(bundle)

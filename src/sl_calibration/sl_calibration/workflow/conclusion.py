@@ -69,7 +69,7 @@ def conclude(
         When the observations do not determine what is asked for.
     """
     try:
-        if not observations.targets:
+        if not observations.has_targets:
             return _conclude_camera(observations, limits, folder)
         outcome = _conclude_rig(observations, limits, folder, tell)
         if outcome.accepted or observations.made_from.get("target") != "camera":
