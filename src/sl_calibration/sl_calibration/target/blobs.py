@@ -39,6 +39,12 @@ class Blobs(NamedTuple):
         return np.asarray(np.linalg.det(self.shapes_px2) ** 0.25)
 
 
+def inverse_roots(shapes_px2: Array) -> Array:
+    """S^-1/2 of shapes S, both (N, 2, 2): maps each ellipse on the unit circle."""
+    values, vectors = np.linalg.eigh(shapes_px2)
+    return np.asarray(np.einsum("nij,nj,nkj->nik", vectors, 1 / np.sqrt(values), vectors))
+
+
 def find_blobs(image: Image) -> Blobs:
     """Find dark elliptic spots in an image (H, W), one entry each, in no order."""
     smooth = cv2.GaussianBlur(image, (3, 3), 0)

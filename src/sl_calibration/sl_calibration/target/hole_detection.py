@@ -171,7 +171,7 @@ def _fitted(grey: Image, plate: Plate, ids: Ids, start: Blobs, full: float) -> H
     gap = step * (1 - (plate.diameter_m + 2 * plate.chamfer_m) / plate.pitch_m)
     resolved = start.sizes_px * plate.chamfer_m / plate.radius_m(ids) > MIN_CHAMFER_PX
     rim = 1 + np.where(resolved, plate.chamfer_m / plate.radius_m(ids), 0.0)
-    return fit_holes(grey, start.centres_px, start.shapes_px2, gap, full, rim)
+    return fit_holes(grey, start, gap, rim, full)
 
 
 def _nominal_shapes(plate: Plate, ids: Ids, start: Blobs) -> Array:

@@ -16,11 +16,12 @@ around the hole as a cone's light does.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sl_calibration.target.blobs import Blobs, inverse_roots
 from sl_common.kernel_cache import kernel
 from sl_reconstruct.decode.row_threads import share_rows
 
@@ -75,13 +76,48 @@ class HoleFits(NamedTuple):
     saturated: Array
 
 
+class _Starts(NamedTuple):
+    """Parameters (N, 15), largest reach (N,) px on either side of the edge, ratio of rims (N,)."""
+
+    parameters: Array
+    reach: Array
+    rim: Array
+
+
+class _Results(NamedTuple):
+    """Parameters (N, 15), covariances of the centres (N, 2, 2), misfit and saturation (N, 2)."""
+
+    parameters: Array
+    covariance: Array
+    quality: Array
+
+
+class _Hole(NamedTuple):
+    """Of one hole: parameters (15,) to start from; covariance (2, 2) and quality (2,) to fill."""
+
+    start: Array
+    covariance: Array
+    quality: Array
+
+
+class _Edge(NamedTuple):
+    """Pixels (K, 3) = (u, v, level) about an edge, ratio of rims, variances (hole, plate)."""
+
+    pixels: Array
+    ratio: float
+    noise: tuple[float, float]
+
+
+class _Equations(NamedTuple):
+    """Derivatives of a pixel's level (15,), normal matrix (P, P) and right side (P,)."""
+
+    row: Array
+    matrix: Array
+    right: Array
+
+
 def fit_holes(
-    image: Image,
-    centres_px: Array,
-    shapes_px2: Array,
-    gap_px: Array,
-    saturation: float,
-    rim_ratio: Array | None = None,
+    image: Image, spots: Blobs, gap_px: Array, rim_ratio: Array, saturation: float
 ) -> HoleFits:
     """Fit the edges of dark holes.
 
@@ -89,88 +125,73 @@ def fit_holes(
     ----------
     image : ndarray, (H, W) float32
         Dark holes on a bright plate, DN.
-    centres_px, shapes_px2 : ndarray, (N, 2) and (N, 2, 2)
-        Start: to a quarter of a radius.
+    spots : Blobs
+        N starts: to a quarter of a radius.
     gap_px : ndarray, (N,)
         Bright plate between a hole and its next neighbour.
+    rim_ratio : ndarray, (N,)
+        Diameter at the top of the chamfer over that at its bottom; 1 without a chamfer.
     saturation : float
         Level at which the sensor is full, in the units of the image; inf for none.
-    rim_ratio : ndarray, (N,), optional
-        Diameter at the top of the chamfer over that at its bottom.
     """
-    count = len(centres_px)
+    count = len(spots.centres_px)
     start = np.zeros((count, PARAMETERS))
-    start[:, CENTRE : CENTRE + 2] = centres_px
-    start[:, SHAPE : SHAPE + 3] = _inverse_root(shapes_px2)
-    small = np.sqrt(np.linalg.eigvalsh(shapes_px2)[:, 0])
+    start[:, CENTRE : CENTRE + 2] = spots.centres_px
+    start[:, SHAPE : SHAPE + 3] = inverse_roots(spots.shapes_px2)[:, [0, 0, 1], [0, 1, 1]]
+    small = np.sqrt(np.linalg.eigvalsh(spots.shapes_px2)[:, 0])
     reach = np.clip(REACH_SHARE * np.minimum(gap_px, 2.0 * small), MIN_REACH_PX, None)
-    out = np.full((count, PARAMETERS), np.nan)
-    covariance = np.full((count, 2, 2), np.nan)
-    quality = np.full((count, 2), np.nan)
-    rim = np.ones(count) if rim_ratio is None else rim_ratio
+    starts = _Starts(start, reach, rim_ratio)
+    shapes = (count, PARAMETERS), (count, 2, 2), (count, 2)
+    out = _Results(*(np.full(shape, np.nan) for shape in shapes))
 
     def work(first: int, last: int) -> None:
-        k = slice(first, last)
-        _fit_all(
-            image, start[k], reach[k], rim[k], float(saturation), out[k], covariance[k], quality[k]
-        )
+        _fit_some(image, first, last, starts, float(saturation), out)
 
     share_rows(work, count)
-    m = out[:, [SHAPE, SHAPE + 1, SHAPE + 1, SHAPE + 2]].reshape(-1, 2, 2)
-    failed = ~np.isfinite(out[:, 0])
+    return _fits(out)
+
+
+def _fits(out: _Results) -> HoleFits:
+    p = out.parameters
+    m = p[:, [SHAPE, SHAPE + 1, SHAPE + 1, SHAPE + 2]].reshape(-1, 2, 2)
+    failed = ~np.isfinite(p[:, 0])
     m[failed] = np.eye(2)
-    shapes = np.linalg.inv(m @ m)
+    shapes = np.asarray(np.linalg.inv(m @ m), dtype=np.float64)
     shapes[failed] = np.nan
-    contrast = out[:, BRIGHT] - out[:, DARK]
-    return HoleFits(
-        out[:, :2], shapes, covariance, out[:, BLUR], contrast, quality[:, 0], quality[:, 1]
-    )
-
-
-def _inverse_root(shapes_px2: Array) -> Array:
-    """(uu, uv, vv) of S^-1/2 for shapes S (N, 2, 2): (N, 3)."""
-    values, vectors = np.linalg.eigh(shapes_px2)
-    root = np.einsum("nij,nj,nkj->nik", vectors, 1 / np.sqrt(values), vectors)
-    return np.asarray(root[:, [0, 0, 1], [0, 1, 1]])
+    contrast, quality = p[:, BRIGHT] - p[:, DARK], out.quality.T
+    return HoleFits(p[:, :2], shapes, out.covariance, p[:, BLUR], contrast, *quality)
 
 
 @kernel()
-def _fit_all(
-    image: Any,
-    start: Any,
-    reach: Any,
-    rim: Any,
-    saturation: float,
-    out: Any,
-    covariance: Any,
-    quality: Any,
+def _fit_some(
+    image: Image, first: int, last: int, starts: _Starts, saturation: float, out: _Results
 ) -> None:
-    for k in range(start.shape[0]):
-        p = start[k].copy()
-        inner = min(reach[k], FIRST_REACH_PX if rim[k] == 1.0 else MIN_REACH_PX)
+    for k in range(first, last):
+        rim, most = starts.rim[k], starts.reach[k]
+        hole = _Hole(starts.parameters[k], out.covariance[k], out.quality[k])
+        p = hole.start.copy()
+        inner = min(most, FIRST_REACH_PX if rim == 1.0 else MIN_REACH_PX)
         outer, good = inner, True
-        for i in range(PASSES if rim[k] == 1.0 else CHAMFER_PASSES):
-            ratio = rim[k] if i > 0 else 1.0
-            good = good and _fit(
-                image, p, (inner, outer, ratio), start[k], covariance[k], quality[k]
-            )
+        for i in range(PASSES if rim == 1.0 else CHAMFER_PASSES):
+            good = _fit(image, p, (inner, outer), rim if i > 0 else 1.0, hole)
             if not good:
                 break
-            inner = min(reach[k], max(REACH_BLURS * p[BLUR], MIN_REACH_PX))
-            outer = inner + CHAMFER_STRETCH * (rim[k] - 1.0) / math.sqrt(_det(p))
+            inner = min(most, max(REACH_BLURS * p[BLUR], MIN_REACH_PX))
+            outer = inner + CHAMFER_STRETCH * (rim - 1.0) / math.sqrt(_det(p))
         if good:
-            out[k] = p
-            quality[k, 1] = _saturated_share(image, p, (inner, outer), saturation)
+            out.parameters[k] = p
+            out.quality[k, 1] = _saturated_share(image, p, (inner, outer), saturation)
 
 
 @kernel()
-def _det(p: Any) -> Any:
+def _det(p: Array) -> float:
     """Determinant of M: one over the product of the semi-axes."""
-    return p[2] * p[4] - p[3] * p[3]
+    det: float = p[2] * p[4] - p[3] * p[3]
+    return det
 
 
 @kernel()
-def _distance(p: Any, x: float, y: float) -> Any:
+def _distance(p: Array, x: float, y: float) -> tuple[float, float, float, float]:
     """Return (q1, q2, |q|, |grad |q||) of a pixel."""
     dx, dy = x - p[0], y - p[1]
     q1, q2 = p[2] * dx + p[3] * dy, p[3] * dx + p[4] * dy
@@ -180,9 +201,9 @@ def _distance(p: Any, x: float, y: float) -> Any:
 
 
 @kernel()
-def _window(p: Any, limit: float, shape: Any) -> Any:
+def _window(p: Array, limit: float, shape: tuple[int, int]) -> tuple[int, int, int, int, bool]:
     """Rows and columns of pixels within reach; ok is False where they leave the image."""
-    det = p[2] * p[4] - p[3] * p[3]
+    det = _det(p)
     if not det > 1e-12:
         return 0, 0, 0, 0, False
     # semi-extents of the ellipse along u and v: rows of M^-1
@@ -194,7 +215,7 @@ def _window(p: Any, limit: float, shape: Any) -> Any:
 
 
 @kernel()
-def _gather(image: Any, p: Any, limits: Any) -> Any:
+def _gather(image: Image, p: Array, limits: tuple[float, float]) -> Array:
     """Pixels (K, 3) = (u, v, level) within reach of the edge; none where the image ends."""
     u0, u1, v0, v1, inside = _window(p, limits[1], image.shape)
     if not inside or (u1 - u0) * (v1 - v0) > 400000:
@@ -211,7 +232,7 @@ def _gather(image: Any, p: Any, limits: Any) -> Any:
 
 
 @kernel()
-def _start_levels(pixels: Any, p: Any, limits: Any) -> None:
+def _start_levels(pixels: Array, p: Array, limits: tuple[float, float]) -> None:
     """Put the mean levels at the ends of the reach, and a blur of 1 px, into the parameters."""
     sums = np.zeros((2, 2))
     for k in range(pixels.shape[0]):
@@ -229,7 +250,9 @@ def _start_levels(pixels: Any, p: Any, limits: Any) -> None:
 
 
 @kernel()
-def _rim_step(p: Any, q1: float, q2: float, ratio: float, step: float) -> Any:
+def _rim_step(
+    p: Array, q1: float, q2: float, ratio: float, step: float
+) -> tuple[float, float, float, float]:
     """Phi of the chamfer's upper rim, its derivative over q (2), and over the blur."""
     r1, r2 = (q1 - p[SHIFT]) / ratio, (q2 - p[SHIFT + 1]) / ratio
     rho = max(math.sqrt(r1 * r1 + r2 * r2), 1e-9)
@@ -242,7 +265,7 @@ def _rim_step(p: Any, q1: float, q2: float, ratio: float, step: float) -> Any:
 
 
 @kernel()
-def _facing(p: Any, q1: float, q2: float, rho: float, ratio: float) -> Any:
+def _facing(p: Array, q1: float, q2: float, rho: float, ratio: float) -> tuple[float, float]:
     """Unit vector to where the chamfer faces: its light is the same from bottom to top."""
     up = min(max((rho - 1.0) / (ratio - 1.0), 0.0), 1.0)
     e1, e2 = q1 - up * p[SHIFT], q2 - up * p[SHIFT + 1]
@@ -251,7 +274,7 @@ def _facing(p: Any, q1: float, q2: float, rho: float, ratio: float) -> Any:
 
 
 @kernel()
-def _blurred_slope(p: Any, q1: float, q2: float, size: float, bell: float) -> Any:
+def _blurred_slope(p: Array, q1: float, q2: float, size: float, bell: float) -> float:
     """What blur adds at an edge between 0 and the plate's level: ``s (grad P . n)`` bell.
 
     A step whose level changes along its normal n is not blurred to a step times that level: in
@@ -260,11 +283,12 @@ def _blurred_slope(p: Any, q1: float, q2: float, size: float, bell: float) -> An
     n1, n2 = p[2] * q1 + p[3] * q2, p[3] * q1 + p[4] * q2
     g1 = p[2] * p[BRIGHT + 1] + p[3] * p[BRIGHT + 2]
     g2 = p[3] * p[BRIGHT + 1] + p[4] * p[BRIGHT + 2]
-    return p[BLUR] * bell * (n1 * g1 + n2 * g2) / size
+    added: float = p[BLUR] * bell * (n1 * g1 + n2 * g2) / size
+    return added
 
 
 @kernel()
-def _model(p: Any, x: float, y: float, ratio: float, row: Any) -> Any:
+def _model(p: Array, x: float, y: float, ratio: float, row: Array) -> tuple[float, float]:
     """Level of a pixel; its derivatives go to ``row``. Returns (level, Phi)."""
     q1, q2, rho, steep = _distance(p, x, y)
     dx, dy = x - p[0], y - p[1]
@@ -295,7 +319,7 @@ def _model(p: Any, x: float, y: float, ratio: float, row: Any) -> Any:
 
 
 @kernel()
-def _noise(pixels: Any, p: Any, ratio: float, row: Any) -> Any:
+def _noise(pixels: Array, p: Array, ratio: float, row: Array) -> tuple[float, float]:
     """Variances in the hole and on the plate, from the residuals beside the edge."""
     sums = np.zeros((2, 2))
     for k in range(pixels.shape[0]):
@@ -311,68 +335,59 @@ def _noise(pixels: Any, p: Any, ratio: float, row: Any) -> Any:
 
 
 @kernel()
-def _normal(pixels: Any, p: Any, ratio: float, noise: Any, row: Any, a: Any, b: Any) -> Any:
-    """Weighted normal equations; returns the cost (Huber) and the plain sums."""
+def _normal(edge: _Edge, p: Array, to: _Equations) -> tuple[float, float]:
+    """Fill the weighted normal equations; returns the cost (Huber) and the plain sum of squares."""
+    row, a, b = to.row, to.matrix, to.right
     a[:] = 0.0
     b[:] = 0.0
     cost, squares = 0.0, 0.0
-    count = PLAIN if ratio == 1.0 else PARAMETERS
-    for k in range(pixels.shape[0]):
-        level, phi = _model(p, pixels[k, 0], pixels[k, 1], ratio, row)
-        r = pixels[k, 2] - level
-        variance = noise[0] + (noise[1] - noise[0]) * phi
+    dark, bright = edge.noise
+    for k in range(edge.pixels.shape[0]):
+        level, phi = _model(p, edge.pixels[k, 0], edge.pixels[k, 1], edge.ratio, row)
+        r = edge.pixels[k, 2] - level
+        variance = dark + (bright - dark) * phi
         z = abs(r) / math.sqrt(variance)
         weight = (1.0 if z < HUBER else HUBER / z) / variance
         cost += 0.5 * z * z if z < HUBER else HUBER * (z - 0.5 * HUBER)
         squares += r * r
-        for i in range(count):
+        for i in range(b.size):
             b[i] += weight * row[i] * r
             for j in range(i + 1):
                 a[i, j] += weight * row[i] * row[j]
-    for i in range(count):
+    for i in range(b.size):
         for j in range(i):
             a[j, i] = a[i, j]
     return cost, squares
 
 
 @kernel()
-def _sane(p: Any, start: Any) -> Any:
+def _sane(p: Array, start: Array) -> bool:
     """Whether parameters are still those of the hole that the fit was started on."""
-    shift = math.hypot(p[0] - start[0], p[1] - start[1]) * math.sqrt(
-        abs(start[2] * start[4] - start[3] * start[3])
-    )
-    det = p[2] * p[4] - p[3] * p[3]
-    was = start[2] * start[4] - start[3] * start[3]
-    return (
-        shift < MAX_SHIFT
-        and p[BLUR] > 0.1
-        and p[BLUR] < 20.0
-        and p[2] + p[4] > 0.0
-        and det > was / 4.0
-        and det < was * 4.0
-    )
+    det, was = _det(p), _det(start)
+    shift = math.hypot(p[0] - start[0], p[1] - start[1]) * math.sqrt(abs(was))
+    shape = p[2] + p[4] > 0.0 and was / 4.0 < det < was * 4.0
+    return shift < MAX_SHIFT and 0.1 < p[BLUR] < 20.0 and shape
 
 
 @kernel()
-def _descend(
-    pixels: Any, p: Any, ratio: float, noise: Any, row: Any, a: Any, b: Any, start: Any
-) -> Any:
-    """Levenberg-Marquardt on the parameters in place; returns the sum of squares, a as at p."""
-    cost, squares = _normal(pixels, p, ratio, noise, row, a, b)
-    trial_a, trial_b = np.empty_like(a), np.empty_like(b)
+def _descend(edge: _Edge, p: Array, at: _Equations, start: Array) -> float:
+    """Levenberg-Marquardt on the parameters in place; returns the sum of squares; fills ``at``."""
+    cost, squares = _normal(edge, p, at)
+    a, b = at.matrix, at.right
+    trial_at = _Equations(at.row, np.empty_like(a), np.empty_like(b))
     damping = 1e-4
     for _ in range(ITERATIONS):
         damped = a.copy()
-        for i in range(a.shape[0]):
+        for i in range(b.size):
             damped[i, i] += damping * a[i, i] + 1e-12
         trial = p.copy()
-        trial[: a.shape[0]] += np.linalg.solve(damped, b)
+        trial[: b.size] += np.linalg.solve(damped, b)
         if _sane(trial, start):
-            trial_cost, trial_squares = _normal(pixels, trial, ratio, noise, row, trial_a, trial_b)
+            trial_cost, trial_squares = _normal(edge, trial, trial_at)
             done = abs(cost - trial_cost) < DONE * cost
             better = trial_cost <= cost
             if better:
-                p[:], a[:], b[:] = trial, trial_a, trial_b
+                p[:], a[:], b[:] = trial, trial_at.matrix, trial_at.right
                 cost, squares = trial_cost, trial_squares
                 damping *= 0.1
             if done:
@@ -386,35 +401,33 @@ def _descend(
 
 
 @kernel()
-def _fit(image: Any, p: Any, reach: Any, start: Any, covariance: Any, quality: Any) -> Any:
-    """One pass: gather pixels, find the noise, descend; False where there is no hole.
-
-    ``reach`` is (px inside the edge, px outside, ratio of the rim).
-    """
-    inner, outer, ratio = reach
+def _fit(image: Image, p: Array, reach: tuple[float, float], ratio: float, hole: _Hole) -> bool:
+    """One pass: gather pixels within reach, find the noise, descend; False: there is no hole."""
     count = PLAIN if ratio == 1.0 else PARAMETERS
-    pixels = _gather(image, p, (inner, outer))
+    pixels = _gather(image, p, reach)
     if pixels.shape[0] < 3 * count:
         return False
     if p[BLUR] == 0.0 or (ratio > 1.0 and p[CHAMFER] == 0.0):
         chamfer = p[BRIGHT]  # a narrow reach sees no further than the chamfer
-        _start_levels(pixels, p, (inner, outer))
+        _start_levels(pixels, p, reach)
         p[CHAMFER] = chamfer
-    row, a, b = np.zeros(PARAMETERS), np.zeros((count, count)), np.zeros(count)
-    noise = _noise(pixels, p, ratio, row)
-    squares = _descend(pixels, p, ratio, noise, row, a, b, start)
+    at = _Equations(np.zeros(PARAMETERS), np.zeros((count, count)), np.zeros(count))
+    edge = _Edge(pixels, ratio, _noise(pixels, p, ratio, at.row))
+    squares = _descend(edge, p, at, hole.start)
     contrast = p[BRIGHT] - p[DARK]
-    if not (contrast > 1.0 and _sane(p, start)):
+    if not (contrast > 1.0 and _sane(p, hole.start)):
         return False
     for i in range(count):
-        a[i, i] += 1e-12 * (1.0 + a[i, i])
-    covariance[:] = np.linalg.inv(a)[:2, :2]
-    quality[0] = math.sqrt(squares / pixels.shape[0]) / contrast
+        at.matrix[i, i] += 1e-12 * (1.0 + at.matrix[i, i])
+    hole.covariance[:] = np.linalg.inv(at.matrix)[:2, :2]
+    hole.quality[0] = math.sqrt(squares / pixels.shape[0]) / contrast
     return True
 
 
 @kernel()
-def _saturated_share(image: Any, p: Any, limits: Any, saturation: float) -> float:
+def _saturated_share(
+    image: Image, p: Array, limits: tuple[float, float], saturation: float
+) -> float:
     """Share of the plate's pixels beside the edge that are at the top of the scale."""
     pixels = _gather(image, p, limits)
     full, count = 0, 0

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from sl_calibration.target.blobs import Blobs
+from sl_calibration.target.blobs import Blobs, inverse_roots
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -67,10 +67,8 @@ def _seeds(blobs: Blobs, tree: KDTree, pitch_in_radii: float) -> list[tuple[int,
     count = min(NEIGHBOURS + 1, len(blobs.centres_px))
     _, near = tree.query(blobs.centres_px, k=count)
     near = near[:, 1:]
-    values, vectors = np.linalg.eigh(blobs.shapes_px2)
-    whiten = np.einsum("nij,nj,nkj->nik", vectors, 1 / np.sqrt(values), vectors)
     offsets = blobs.centres_px[near] - blobs.centres_px[:, None]
-    round_ = np.einsum("nij,nkj->nki", whiten, offsets)
+    round_ = np.einsum("nij,nkj->nki", inverse_roots(blobs.shapes_px2), offsets)
     ratio = np.linalg.norm(round_, axis=2) / pitch_in_radii
     alike = np.abs(np.log(blobs.sizes_px[near] / blobs.sizes_px[:, None])) < np.log(SIZE_RATIO)
     ratio = np.where(alike & (ratio > DISTANCE_RANGE[0]), ratio, np.inf)
@@ -86,10 +84,10 @@ def _seeds(blobs: Blobs, tree: KDTree, pitch_in_radii: float) -> list[tuple[int,
 def _basis(offsets: Array, chosen: Array, angle: Array, fourfold: complex) -> Array | None:
     """Mean steps along both axes of a cross, columns of (2, 2); None without both."""
     quadrant = np.rint((angle - np.angle(fourfold) / 4) / (np.pi / 2)).astype(int) % 4
-    arms = [offsets[chosen & (quadrant == q)].mean(axis=0) for q in range(4) if
-            np.any(chosen & (quadrant == q))]  # fmt: skip
-    if len(arms) < 4:
+    members = [offsets[chosen & (quadrant == q)] for q in range(4)]
+    if not all(len(arm) for arm in members):
         return None
+    arms = [arm.mean(axis=0) for arm in members]
     return np.stack([(arms[0] - arms[2]) / 2, (arms[1] - arms[3]) / 2], axis=1)
 
 
