@@ -163,9 +163,9 @@ class Session(Generic[_SeenT]):
 
     Parameters
     ----------
-    gear : CalibrationDevices
-        The devices.
-    order : CalibrationRequest
+    devices : CalibrationDevices
+        Stage, projector and camera.
+    request : CalibrationRequest
         What is asked for.
     observe : callable
         Makes what is wanted of what was taken, or raises why it cannot.
@@ -179,14 +179,14 @@ class Session(Generic[_SeenT]):
 
     def __init__(
         self,
-        gear: CalibrationDevices,
-        order: CalibrationRequest,
+        devices: CalibrationDevices,
+        request: CalibrationRequest,
         observe: Callable[[Stack, CalibrationRequest], _SeenT],
         tell: Tell,
         stage_tolerance_m: float = 5e-6,
         compare: Callable[[_SeenT, _SeenT], None] = lambda _before, _after: None,
     ) -> None:
-        self._gear, self._order = gear, order
+        self._devices, self._request = devices, request
         self._observe, self._compare, self._tell = observe, compare, tell
         self._tolerance_m = stage_tolerance_m
 
@@ -202,20 +202,20 @@ class Session(Generic[_SeenT]):
         CalibrationError, DeviceError
             With the place at which it happened.
         """
-        start = self._gear.where()
-        places = [(start[0] + x, start[1] + y, z) for x, y, z in self._order.places]
+        start = self._devices.where()
+        places = [(start[0] + x, start[1] + y, z) for x, y, z in self._request.places]
         for place in places:
-            self._gear.check(place)
+            self._devices.check(place)
         try:
             views = self._take_all(places)
         except RunCancelled:
-            self._gear.halt()
+            self._devices.halt()
             raise
         except SlError:
-            with suppress(SlError):  # the first error is the one to be told
-                self._gear.move(start)
+            with suppress(SlError):  # the first error is the one that counts
+                self._devices.move(start)
             raise
-        self._gear.move(start)
+        self._devices.move(start)
         return views
 
     def _take_all(self, places: list[Place]) -> tuple[_SeenT, ...]:
@@ -226,7 +226,7 @@ class Session(Generic[_SeenT]):
             for i, place in enumerate(places):
                 with _naming(i, places):
                     taken = self._take(i, place)
-                looked.append(beside.submit(self._observe, taken, self._order))
+                looked.append(beside.submit(self._observe, taken, self._request))
                 del taken  # a stack is large: two at a time
                 if i:
                     self._accept(i - 1, places, looked, views)
@@ -245,9 +245,9 @@ class Session(Generic[_SeenT]):
 
     def _take(self, i: int, place: Place) -> Stack:
         self._report("home", i)
-        self._check_place(self._gear.move(place), place)
+        self._check_place(self._devices.move(place), place)
         self._report("planes", i)
-        taken = self._gear.take(self._order.sequence)
+        taken = self._devices.take(self._request.sequence)
         self._check_place(taken.place, place)
         self._report("plate", i)
         return taken
@@ -260,7 +260,7 @@ class Session(Generic[_SeenT]):
             )
 
     def _report(self, stage: str, i: int) -> None:
-        views = len(self._order.places)
+        views = len(self._request.places)
         fraction = _TAKING * (i + _BEGINS[stage]) / views
         self._tell(CalibrationProgress(stage, i + 1, views, fraction))
 
@@ -284,6 +284,11 @@ def in_words(place: Place) -> str:
 
 def check_motion(before: View, after: View) -> None:
     """Refuse two views at different places that show the plate in the same one.
+
+    Parameters
+    ----------
+    before, after : View
+        Taken one after the other.
 
     Raises
     ------

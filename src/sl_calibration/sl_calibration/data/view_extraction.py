@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -38,10 +39,15 @@ SMOOTH_CELLS = 6.0
 _NO_TARGETS = Correspondences(*np.empty((3, 0, 2)))
 
 
-def observe(stack: Stack, order: CalibrationRequest) -> View:
+def observe(stack: Stack, request: CalibrationRequest) -> View:
     """Measure the plate in one stack.
 
-    Without ``order.patterns`` only the holes are looked for, and the view has no targets.
+    Parameters
+    ----------
+    stack : Stack
+        The stack, and where the stage stood.
+    request : CalibrationRequest
+        The plate; without ``patterns`` only its holes are looked for, and the view has no targets.
 
     Raises
     ------
@@ -49,11 +55,11 @@ def observe(stack: Stack, order: CalibrationRequest) -> View:
         When the projector gives no light, the plate is not there or not as it should be, or the
         projector's patterns are not seen on it.
     """
-    check_target_light(stack.images, stack.sequence)
+    check_target_light(stack.images)
     full_dn = full_scale_dn(stack.images)
     white = white_image(stack.images, stack.sequence)
-    holes = find_plate(white, order.plate, full_dn)
-    targets = _targets(stack, white) if order.patterns else _NO_TARGETS
+    holes = find_plate(white, request.plate, full_dn)
+    targets = _targets(stack, white) if request.patterns else _NO_TARGETS
     good = holes.good
     return View(
         stack.place[2],
@@ -69,13 +75,25 @@ def observe(stack: Stack, order: CalibrationRequest) -> View:
     )
 
 
-def _targets(stack: Stack, white: NDArray[np.float32]) -> Correspondences:
+def decoded_targets(stack: Stack) -> Correspondences:
+    """Projector's coordinates on whatever lies there.
+
+    Raises
+    ------
+    CalibrationError
+        When there are too few.
+    """
     found = correspondences(stack.images, stack.sequence)
     if len(found) < MIN_TARGETS:
         raise CalibrationError(
             f"the projector's coordinates were decoded at {len(found)} places; expected at least "
-            f"{MIN_TARGETS}: is the plate in focus and evenly lit, and the exposure right?"
+            f"{MIN_TARGETS}: is what lies there in focus and evenly lit, and the exposure right?"
         )
+    return found
+
+
+def _targets(stack: Stack, white: NDArray[np.float32]) -> Correspondences:
+    found = decoded_targets(stack)
     spread = np.std(found.dmd_px, axis=0) / np.std(found.camera_px, axis=0)
     moved = LIGHT_SLOPE_PX2 * light_slope(white, found.camera_px) * float(spread.max())
     model = np.hypot(moved, MODEL_SIGMA_PX)[:, np.newaxis]
@@ -83,7 +101,15 @@ def _targets(stack: Stack, white: NDArray[np.float32]) -> Correspondences:
 
 
 def light_slope(white: NDArray[np.float32], at_px: Array) -> Array:
-    """Relative slope (N,) of the light on the plate at pixels (N, 2), per pixel; holes apart."""
+    """Relative slope (N,) of the light on the plate, per pixel; holes apart.
+
+    Parameters
+    ----------
+    white : ndarray, (H, W)
+        Image under full light.
+    at_px : ndarray, (N, 2)
+        Pixels (u, v).
+    """
     size = (white.shape[1] // CELL_PX, white.shape[0] // CELL_PX)
     cells = cv2.resize(white, size, interpolation=cv2.INTER_AREA)
     near = cv2.dilate(cells, np.ones((9, 9), np.uint8))
@@ -100,6 +126,18 @@ def white_image(stack: NDArray[Any], sequence: PatternSequence) -> NDArray[np.fl
 
     Averaging over all pairs takes the camera's noise down by their number's root, and the stripes
     cancel exactly.
+
+    Parameters
+    ----------
+    stack : ndarray, (N, H, W)
+        Images in pattern order.
+    sequence : PatternSequence
+        What was projected.
+
+    Raises
+    ------
+    CalibrationError
+        When the sequence has neither white nor pairs.
     """
     pairs = _pairs(sequence)
     lit = [i for i, p in enumerate(sequence.patterns) if _full(p) is True]
@@ -110,15 +148,12 @@ def white_image(stack: NDArray[Any], sequence: PatternSequence) -> NDArray[np.fl
             "expected one of them to find the holes in"
         )
     total = np.zeros(stack.shape[1:], np.float32)
-    for i in lit:
+    for i in [*lit, *itertools.chain(*pairs)]:
         total += stack[i]
     # A pair holds the ambient light twice, white holds it once.
     ambient = np.zeros_like(total)
     for i in dark:
         ambient += stack[i] / np.float32(len(dark))
-    for i, j in pairs:
-        total += stack[i]
-        total += stack[j]
     white: NDArray[np.float32] = total - np.float32(len(pairs)) * ambient
     white /= len(lit) + len(pairs)
     return white
@@ -135,8 +170,13 @@ def _pairs(sequence: PatternSequence) -> list[tuple[int, int]]:
     return [(i, j) for i, j in found if i < j]
 
 
-def check_target_light(stack: NDArray[Any], sequence: PatternSequence) -> None:
+def check_target_light(stack: NDArray[Any]) -> None:
     """Refuse a stack on which the projector's light makes no difference.
+
+    Parameters
+    ----------
+    stack : ndarray, (N, H, W)
+        Images in pattern order.
 
     Raises
     ------

@@ -211,18 +211,8 @@ def _view(plate: Plate, ids: Ids, fits: HoleFits, size: tuple[int, int]) -> Plat
     poor |= _odd_size(fits, map_circles(seen, xy, radius), radius)
     flags = HoleFlag.POOR_EDGE * poor + HoleFlag.OUTLIER * (z > OUTLIER_SIGMAS)
     flags = (flags + HoleFlag.SATURATED * (fits.saturated > MIN_SATURATED)).astype(np.uint8)
-    view = PlateView(
-        ids,
-        xy,
-        fits.centres_px - bias,
-        sigma,
-        covariance,
-        flags,
-        missing=_unseen(plate, ids, seen, size),
-        bias_px=bias,
-        axes_px=np.sqrt(np.linalg.eigvalsh(fits.shapes_px2)[:, ::-1]),
-        blur_px=float(np.median(fits.blur_px)),
-    )
+    centres, missing = fits.centres_px - bias, _unseen(plate, ids, seen, size)
+    view = PlateView(ids, xy, centres, sigma, covariance, flags, missing, bias_px=bias)
     return view.taken(np.lexsort((ids[:, 0], ids[:, 1])))
 
 

@@ -147,10 +147,6 @@ class PlateView:
         Holes that should be in view but were not found: blocked, or out of the light.
     bias_px : ndarray, (N, 2)
         Centre of the fitted ellipse minus ``centres_px``: what was corrected.
-    axes_px : ndarray, (N, 2)
-        Semi-axes of the ellipses, larger first.
-    blur_px : float
-        Median standard deviation of the edges.
     """
 
     ids: Ids
@@ -161,8 +157,6 @@ class PlateView:
     flags: NDArray[np.uint8]
     missing: Ids
     bias_px: Array
-    axes_px: Array
-    blur_px: float
 
     @property
     def good(self) -> NDArray[np.bool_]:
@@ -171,6 +165,5 @@ class PlateView:
 
     def taken(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> PlateView:
         """Return a view of some of the holes (a mask or indices (K,)), in that order."""
-        names = ["ids", "plate_xy_m", "centres_px", "sigma_px", "covariance_px2", "flags"]
-        names += ["bias_px", "axes_px"]
+        names = [name for name in self.__dataclass_fields__ if name != "missing"]
         return replace(self, **{name: getattr(self, name)[which] for name in names})

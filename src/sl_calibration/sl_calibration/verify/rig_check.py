@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sl_calibration.data.session import CalibrationRequest
-from sl_calibration.data.view_extraction import MIN_TARGETS, check_target_light, observe
+from sl_calibration.data.view_extraction import check_target_light, decoded_targets, observe
 from sl_calibration.solve.ray_midpoints import triangulate
 from sl_calibration.target.plate import Plate
 from sl_common.errors import CalibrationError
 from sl_projector.sequence.stack import Stack
 from sl_reconstruct.model.calibration_file import Calibration
 from sl_reconstruct.model.rig import Rig
-from sl_reconstruct.reconstruction.correspondence import correspondences
 
 Array = NDArray[np.float64]
 
@@ -179,7 +178,15 @@ def stage_z_axis(calibration: Calibration) -> Array:
 
 
 def default_heights(made_from: Mapping[str, Any], here_m: float) -> tuple[float, ...]:
-    """Three heights among those of a calibration; where the stage stands if they are not known."""
+    """Heights to check at, metres, where none are asked for.
+
+    Parameters
+    ----------
+    made_from : mapping
+        Of the calibration: three heights among its ``heights_m`` ...
+    here_m : float
+        ... or where the stage stands, if they are not known.
+    """
     heights = made_from.get("heights_m") or ()
     if len(heights) < 2:
         return (here_m,)
@@ -216,10 +223,11 @@ def check_rig_on(stack: Stack, target: str, plate: Plate, rig: Rig) -> Check:
         )
     check_target(target)
     if target == "flat":
-        return check_on(rig, stack.place[2], _seen(stack))
-    view = observe(
-        stack, CalibrationRequest("both", (stack.place[2],), plate, stack.sequence.name, least=1)
-    )
+        check_target_light(stack.images)
+        found = decoded_targets(stack)
+        return check_on(rig, stack.place[2], (found.camera_px, found.dmd_px))
+    name = stack.sequence.name
+    view = observe(stack, CalibrationRequest("both", (stack.place[2],), plate, name, least=1))
     targets, holes = (view.camera_px, view.dmd_px), (view.centres_px, view.plate_xy_m)
     return check_on(rig, stack.place[2], targets, holes)
 
@@ -256,18 +264,6 @@ def check_target(target: str) -> None:
     """Refuse what cannot be checked on."""
     if target not in TARGETS:
         raise CalibrationError(f"target={target!r}; expected one of {TARGETS}")
-
-
-def _seen(stack: Stack) -> tuple[Array, Array]:
-    """Camera pixels and DMD coordinates on a flat."""
-    check_target_light(stack.images, stack.sequence)
-    found = correspondences(stack.images, stack.sequence)
-    if len(found) < MIN_TARGETS:
-        raise CalibrationError(
-            f"the projector's coordinates were decoded at {len(found)} places; expected at "
-            f"least {MIN_TARGETS} on a flat"
-        )
-    return found.camera_px, found.dmd_px
 
 
 def _plane(points: Array) -> tuple[Array, Array]:
