@@ -204,14 +204,15 @@ def test_a_new_namespace_moves_the_nodes_but_not_the_bench(tmp_path: Path) -> No
 
 def test_relative_paths_are_those_of_the_users_file(tmp_path: Path) -> None:
     source = tmp_path / "rig.yaml"
-    source.write_text("/sl/reconstruct: {ros__parameters: {calibration_file: ../cal.yaml}}")
+    source.write_text("/sl/calibration: {ros__parameters: {calibration_file: ../cal.yaml}}")
     written = sections(write_config(source, tmp_path / "run", Changes()))
-    assert written["/sl/reconstruct"]["calibration_file"] == str(tmp_path.parent / "cal.yaml")
+    assert written["/sl/calibration"]["calibration_file"] == str(tmp_path.parent / "cal.yaml")
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[1, 2]", "/sl/camera: 3", "/sl/camera: {exposure_s: 1}", "a: [", "a: 1\na: 2"]
-)
+    "text", ["", "[1, 2]", "/sl/camera: 3", "/sl/camera: {exposure_s: 1}", "a: [", "a: 1\na: 2",
+     "/sl/reconstruct: {ros__parameters: {calibration_file: one_owner.yaml}}"],
+)  # fmt: skip
 def test_a_file_that_is_no_parameter_file_is_refused(tmp_path: Path, text: str) -> None:
     source = tmp_path / "rig.yaml"
     source.write_text(text)

@@ -36,7 +36,8 @@ NODES = {
     "camera": ("sl_camera.camera_node", "address:={}/camera.sock"),
     "stage": ("sl_camera.stage_node", "port:={}/stage"),
     "synchronizer": ("sl_camera.synchronizer_node", "require_pose:=true"),
-    "reconstruct": ("sl_reconstruct.reconstruct_node", "calibration_file:={}/rig.yaml"),
+    "reconstruct": ("sl_reconstruct.reconstruct_node", "estimator:=matched"),
+    "calibration": ("sl_calibration.calibration_node", "calibration_file:={}/rig.yaml"),
 }
 
 

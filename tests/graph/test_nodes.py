@@ -31,6 +31,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from sl_bench.dlpc.dlpc900_emulator import Dlpc900Emulator  # noqa: E402
 from sl_bench.dlpc.usb_server import EmulatedUsb, UsbSocketServer  # noqa: E402
+from sl_calibration.calibration_node import CalibrationNode  # noqa: E402
 from sl_camera.camera.camera import Frame, FrameStatus  # noqa: E402
 from sl_camera.camera_node import CameraNode  # noqa: E402
 from sl_camera.stage_node import StageNode  # noqa: E402
@@ -216,12 +217,20 @@ def assert_plane(message: PointCloud2) -> None:
     assert np.median(np.abs(error[there])) < PLANE_TOLERANCE_M
 
 
+def calibrated_by(graph: Graph, calibration: Path) -> CalibrationNode:
+    """The node that owns the calibration in force."""
+    return graph.add(
+        CalibrationNode, calibration_file=str(calibration), store_dir=str(calibration.parent)
+    )
+
+
 class Works:
     """A reconstruction node with the tiny rig's calibration, and what it publishes."""
 
     def __init__(self, graph: Graph, calibration: Path) -> None:
         self.graph = graph
-        self.node = graph.add(ReconstructNode, calibration_file=str(calibration))
+        self.owner = calibrated_by(graph, calibration)
+        self.node = graph.add(ReconstructNode)
         self.stacks = graph.publisher(topics.STACK)
         self.clouds = graph.collect(topics.POINTS)
         self.refusals = graph.collect(topics.REFUSALS)
@@ -333,7 +342,7 @@ def set_calibration(works: Works, path: Path) -> tuple[bool, str]:
     request = SetParameters.Request(
         parameters=[Parameter("calibration_file", value=str(path)).to_parameter_msg()]
     )
-    answer = works.graph.call(set_parameters("reconstruct"), request)
+    answer = works.graph.call(set_parameters("calibration"), request)
     return answer.results[0].successful, answer.results[0].reason
 
 
@@ -348,12 +357,14 @@ def test_a_calibration_cut_in_half_is_refused_and_the_old_one_stays(
     assert not successful
     assert "half.yaml" in reason
     assert works.node.health().values["calibration"] == before == rig_hash(tiny_rig())
+    assert works.owner.health().values["calibration"] == before
     works.expect_plane()
 
 
 def test_the_calibration_in_force_is_latched_for_who_comes_late(works: Works) -> None:
     found = works.graph.collect(topics.CALIBRATION)
     message = wait(lambda: found and found[0], "the latched calibration")
+    assert works.graph.tester.count_publishers(topics.CALIBRATION.name) == 1
     assert message.hash == rig_hash(tiny_rig())
     assert (message.camera.width, message.camera.height) == (320, 120)
     assert message.projector.header.frame_id == "sl_projector_optical"
@@ -376,14 +387,17 @@ def test_without_a_calibration_a_node_says_so_until_its_file_is_there(tmp_path: 
     path = tmp_path / "later.yaml"
     path.write_text(dump_calibration(tiny_rig())[:500])
     with ros_graph.graph() as graph:
-        node = graph.add(ReconstructNode, calibration_file=str(path))
+        owner = calibrated_by(graph, path)
+        node = graph.add(ReconstructNode)
         stacks = graph.publisher(topics.STACK)
         clouds = graph.collect(topics.POINTS)
         stacks.publish(stack_message())
         wait(lambda: node.counts["synchronizer/stack refused"], "a refusal", 60.0)
-        assert node.health().level == "error"
-        assert "later.yaml" in node.health().message
+        assert node.health().level == "warn"
+        assert owner.health().level == "error"
+        assert "later.yaml" in owner.health().message
         save_calibration(path, tiny_rig())
+        wait(lambda: node.health().values["calibration"], "the calibration")
         stacks.publish(stack_message())
         assert_plane(wait(lambda: clouds and clouds[0], "the cloud", 60.0))
         assert node.health().level == "ok"
@@ -692,7 +706,8 @@ class Rig:
         graph.add(CameraNode, lambda: self.pair.camera)
         graph.add(StageNode, FakeStage, pose_rate_hz=50.0)
         graph.add(SynchronizerNode, timeout_s=0.4)
-        self.node = graph.add(ReconstructNode, calibration_file=str(calibration))
+        calibrated_by(graph, calibration)
+        self.node = graph.add(ReconstructNode)
         self.clouds = graph.collect(topics.POINTS)
         wait(lambda: self.pair.camera.armed and self.pair.projector.opened, "the devices")
         wait(lambda: self.node.health().level == "ok", "the kernels", 200.0)
@@ -831,7 +846,8 @@ def test_a_graph_without_a_camera_says_so(tmp_path: Path) -> None:
     save_calibration(path, tiny_rig())
     with ros_graph.graph() as graph:
         graph.add(tiny_projector, FakeProjector)
-        graph.add(ReconstructNode, calibration_file=str(path), silence_timeout_s=1.0)
+        calibrated_by(graph, path)
+        graph.add(ReconstructNode, silence_timeout_s=1.0)
         answer = graph.call(topics.SCAN, Scan.Request())
         assert not answer.success
         assert "is the camera node running" in answer.message

@@ -17,7 +17,7 @@ from sl_bringup.graph.console import StatusLine, complain, say
 from sl_common.base_node import GraphNode
 from sl_common.errors import BagError, SlError
 from sl_common.messages import stamp_to_msg
-from sl_common.topics import CLOCK, RAW_TOPICS, RECORDED_TOPICS, Topic
+from sl_common.topics import CALIBRATION, CLOCK, RAW_TOPICS, RECORDED_TOPICS, Topic
 
 CLOCK_S, SHOW_S = 0.01, 1.0
 #: Listeners of one process are discovered one after the other.
@@ -39,7 +39,12 @@ class ReplayNode(GraphNode):
         super().__init__("player", namespace=namespace)
         self._clock_topic = self.advertise(CLOCK)
         self._to = {topic: self.advertise(topic) for topic in topics}
+        self._calibrated = False
+        self.listen(CALIBRATION, self._on_calibration)
         self.count = 0
+
+    def _on_calibration(self, _: object) -> None:
+        self._calibrated = True
 
     def await_listeners(self, patience_s: float) -> bool:
         """Wait until somebody listens to a topic that is no latched one."""
@@ -47,9 +52,16 @@ class ReplayNode(GraphNode):
         while not any(p.get_subscription_count() for t, p in self._to.items() if not t.latched):
             if time.monotonic() >= end_s:
                 return False
-            time.sleep(0.05)
-        time.sleep(min(SETTLE_S, patience_s))
+            rclpy.spin_once(self, timeout_sec=0.05)
+        settled_s = time.monotonic() + min(SETTLE_S, patience_s)
+        while (left_s := settled_s - time.monotonic()) > 0:
+            rclpy.spin_once(self, timeout_sec=left_s)
         return True
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the graph has a calibration of its own; ask before `play`."""
+        return self._calibrated
 
     def play(self, messages: Iterator[Raw], rate: float) -> None:
         """Publish at the times of the recording."""
@@ -117,6 +129,9 @@ def _play(args: argparse.Namespace, bag: Bag) -> int:
     heard = node.await_listeners(args.wait) if args.wait else True
     if not heard:
         complain("slrig replay: nobody listens; playing all the same")
+    if node.calibrated and CALIBRATION in topics:
+        topics.remove(CALIBRATION)
+        say("the calibration of the graph stays in force; the recording's is not played")
     node.play(bag.raw(*topics), args.rate)
     reached = node.await_acknowledged(args.wait) if args.wait else True
     say(f"{node.count} messages of {len(topics)} topics")

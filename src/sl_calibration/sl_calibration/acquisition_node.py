@@ -12,19 +12,16 @@ from contextlib import contextmanager
 from typing import Any
 
 from geometry_msgs.msg import Point
-from sl_interfaces.msg import MatchedFrame
-from sl_interfaces.srv import MoveStage
-from std_srvs.srv import Trigger
 
 from sl_calibration.data.session import Place, RunCancelled, in_words
 from sl_common import topics
-from sl_common.base_node import RigNode, next_scan_id
+from sl_common.base_node import RigNode
 from sl_common.errors import CalibrationError, DeviceError, DeviceTimeout, SlError
 from sl_common.messages import stamp_from_msg
 from sl_projector.sequence.messages import stack_from_msg
 from sl_projector.sequence.stack import Stack
-from sl_reconstruct.projector_client_node import ProjectorClient
-from sl_reconstruct.scan.scan_flow import ScanRequest, ScanRun, ScanTimeouts, ScanWatch
+from sl_reconstruct.scan.scan_flow import ScanRequest, ScanTimeouts
+from sl_reconstruct.scan.stack_client import StackClient
 
 #: A stage that is there answers a question about its travel within this.
 _ANSWER_S = 5.0
@@ -38,7 +35,7 @@ _DISCOVERY_S = 10.0
 class GraphDevices:
     """Drives stage and projector by their services and listens to the synchroniser.
 
-    It is `session.CalibrationDevices`, and `scan_flow.ScanDevices` of its own scans.
+    It is `session.CalibrationDevices`.
 
     Parameters
     ----------
@@ -50,9 +47,7 @@ class GraphDevices:
         self._node = node
         self._move = node.client(topics.MOVE_STAGE)
         self._stop_stage = node.client(topics.STOP_STAGE)
-        self._projector = ProjectorClient(node)
-        self._watch: ScanWatch | None = None
-        self._last_id = 0
+        self._stacks = StackClient(node)
         self._cancelled: Callable[[], bool] = lambda: False
         self._pose_ns = 0
         self.move_timeout_s = 120.0
@@ -65,7 +60,7 @@ class GraphDevices:
         """Listen to the synchroniser for one run; its stacks are too large to listen always."""
         self._cancelled = cancelled
         subscriptions = [
-            self._node.listen(topics.FRAME, self._on_frame),
+            self._node.listen(topics.FRAME, self._stacks.on_frame),
             self._node.listen(topics.STACK, self._on_stack),
             self._node.listen(topics.POSE, self._on_pose),
         ]
@@ -73,7 +68,6 @@ class GraphDevices:
             self._await_publishers(subscriptions)
             yield self
         finally:
-            self._watch = None
             self._forget(subscriptions)
 
     def _await_publishers(self, subscriptions: list[Any]) -> None:
@@ -144,7 +138,7 @@ class GraphDevices:
         if not self._move.wait_for_service(timeout_sec=_DISCOVERY_S):
             raise DeviceError(f"nobody offers {topics.MOVE_STAGE.name}: is the stage node running?")
         x, y, z = place
-        request = MoveStage.Request(
+        request = self._move.srv_type.Request(
             target=Point(x=x, y=y, z=z), relative=relative, check_only=check_only
         )
         patience_s = _ANSWER_S if check_only else self.move_timeout_s
@@ -166,16 +160,15 @@ class GraphDevices:
         if not self._node.context.ok():
             return
         if self._stop_stage.service_is_ready():
-            self._stop_stage.call_async(Trigger.Request())
-        self._projector.stop()
+            self._stop_stage.call_async(self._stop_stage.srv_type.Request())
+        self._stacks.stop_projecting()
 
     # -- images ---------------------------------------------------------------------------------
 
     def take(self, sequence: str) -> Stack:
         """Project a sequence; spoilt attempts are repeated."""
-        order = ScanRequest(sequence, 0.0, self.max_repeats, REST_S)
-        result = ScanRun(self, order, lambda _: None, self._cancelled, self.timeouts).run()
-        self._watch = None
+        request = ScanRequest(sequence, 0.0, self.max_repeats, REST_S)
+        result = self._stacks.take(request, lambda _: None, self._cancelled, self.timeouts)
         if result.cancelled:
             raise RunCancelled("calibration cancelled")
         if not result.success:
@@ -183,63 +176,13 @@ class GraphDevices:
         stack: Stack = result.report
         return stack
 
-    def _on_frame(self, message: Any) -> None:
-        watch = self._watch
-        if watch is None or message.scan_id != watch.scan_id:
-            return
-        if message.status == MatchedFrame.MATCHED:
-            watch.matched(message.index, message.count)
-        elif message.status in (MatchedFrame.STACK_COMPLETE, MatchedFrame.STACK_REFUSED):
-            watch.decided(message.status == MatchedFrame.STACK_COMPLETE, message.reason)
-        else:
-            watch.sign()
-
     def _on_stack(self, message: Any) -> None:
-        watch = self._watch
-        if watch is None or message.scan_id != watch.scan_id:
-            return
-        watch.arrived()
-        try:
-            stack = stack_from_msg(message)
-            watch.finished(_with_place(stack))
-        except SlError as error:
-            watch.finished(error)
-
-    # -- what a scan needs (`scan_flow.ScanDevices`) ----------------------------------
-
-    def begin(self) -> ScanWatch:
-        """Take a number that no scan had."""
-        self._last_id = next_scan_id(self._last_id)
-        self._watch = ScanWatch(self._last_id)
-        return self._watch
-
-    def missing(self, patience_s: float) -> str:
-        """Name what a scan cannot do without and nobody offers, even after a while."""
-        end_s = time.monotonic() + patience_s
-        while (gap := self._gap()) and time.monotonic() < end_s and not self._cancelled():
-            time.sleep(_POLL_S)
-        return gap
-
-    def _gap(self) -> str:
-        if gap := self._projector.gap():
-            return gap
-        if not self._node.count_publishers(topics.IMAGE.name):
-            return f"nobody publishes {topics.IMAGE.name}: is the camera node running?"
-        return ""
-
-    def project(self, watch: ScanWatch, order: ScanRequest) -> None:
-        """Ask the projector; the watch is told when it has answered."""
-        self._projector.project(watch, order)
-
-    def stop_projecting(self) -> None:
-        """Ask the projector to stop."""
-        self._projector.stop()
-
-
-def _with_place(stack: Stack) -> Stack:
-    """Refuse a stack without a pose: it is of no use here."""
-    assert stack.place is not None
-    return stack
+        if watch := self._stacks.watch_of(message.scan_id):
+            watch.arrived()
+            try:
+                watch.finished(stack_from_msg(message))
+            except SlError as error:
+                watch.finished(error)
 
 
 def _position(stamped: Any) -> Place:

@@ -11,12 +11,12 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sl_interfaces.action import Calibrate as CalibrateAction
-from sl_interfaces.msg import RigCalibration
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.parameter import Parameter
 from std_msgs.msg import String
 
 from sl_calibration.acquisition_node import GraphDevices
@@ -30,15 +30,17 @@ from sl_calibration.workflow.conclusion import Outcome
 from sl_calibration.workflow.run_record import Pitches
 from sl_calibration.workflow.warm_up import warm_up_apart
 from sl_common import topics
-from sl_common.base_node import Health, RigNode, run
+from sl_common.base_node import Health, RigNode, Task, run
 from sl_common.errors import CalibrationError, SlError
-from sl_common.messages import stamp_from_msg
 from sl_reconstruct.messages import rig_to_msg
-from sl_reconstruct.model.calibration_file import Calibration, load_calibration, parse_calibration
+from sl_reconstruct.model.calibration_file import Calibration, load_calibration
 from sl_reconstruct.scan.scan_flow import ScanTimeouts
 
 _LimitsT = TypeVar("_LimitsT", Limits, VerifyLimits)
 
+NOT_CALIBRATED = "not calibrated"
+#: A calibration file that is not there yet, or is not whole, is looked for again after this.
+RETRY_S = 1.0
 _HEIGHTS_M = [-1e-3, -0.5e-3, 0.0, 0.5e-3, 1e-3]
 
 
@@ -57,19 +59,17 @@ class CalibrationNode(RigNode):
         self._running = threading.Lock()
         self._in_force: Calibration | None = None
         self._source = ""
-        self._since_ns = 0
-        self._fault = "not calibrated"
+        self._fault = ""
         self._last = "no run yet"
         self._rigs = self.advertise(topics.CALIBRATION)
-        self.listen(topics.CALIBRATION, self._on_rig)
         self._load()
-        self._offer()
-        self._compiler = warm_up_apart()
-
-    def _offer(self) -> None:
-        self.serve(topics.CALIBRATE, self._serve)
+        if self._file:
+            self._retry = self.create_timer(RETRY_S, self._load, clock=self.steady)
+        self.add_on_set_parameters_callback(self._on_parameters)
+        task = Task(self._calibrate, fill, _feedback)
+        self._action = self.serve_task(topics.CALIBRATE, topics.CALIBRATE_ACTION, task)
         self.serve(topics.VERIFY, self._serve_verify)
-        self._action = self.serve_action(topics.CALIBRATE_ACTION, self._execute)
+        self._compiler = warm_up_apart()
 
     # -- parameters -----------------------------------------------------------------------------
 
@@ -79,8 +79,9 @@ class CalibrationNode(RigNode):
             or default_directory()
         ).expanduser())  # fmt: skip
         self._file = self.declare(
-            "calibration_file", "", "in force at the start; empty: the last accepted in store_dir"
-        )
+            "calibration_file", "", "in force at the start; empty: the last accepted in store_dir",
+            live=True,
+        )  # fmt: skip
         self.declare("heights_m", _HEIGHTS_M, "stage heights of the views, m", live=True)
         self.declare("sequence", "precise-rows", "patterns, both axes", live=True)
         self._declare_plate()
@@ -165,7 +166,10 @@ class CalibrationNode(RigNode):
     # -- the calibration in force -----------------------------------------------------------------
 
     def _load(self) -> None:
-        """Put the named file, else the last accepted run, in force; a bad one is told."""
+        """Put the named file, else the last accepted run, in force as soon as it is there."""
+        if self._in_force is not None:
+            self._retry.cancel()
+            return
         try:
             path = Path(self._file) if self._file else self._store.current()
             if path is None:
@@ -174,29 +178,33 @@ class CalibrationNode(RigNode):
             since_ns = path.stat().st_mtime_ns if self._file else self._store.in_force_since_ns()
             self._put_in_force(calibration, str(path), since_ns)
         except (SlError, OSError) as error:
-            self._fault = str(error)
-            self.complain("stored calibration", error)
+            if str(error) != self._fault:
+                self._fault = str(error)
+                self.complain("stored calibration", error)
 
     def _put_in_force(self, calibration: Calibration, source: str, since_ns: int) -> None:
-        self._in_force, self._source, self._since_ns = calibration, source, since_ns
+        self._in_force, self._source, self._fault = calibration, source, ""
         self._rigs.publish(rig_to_msg(calibration, source, since_ns))
         self.get_logger().info(f"calibration {calibration.hash[:12]} of {source} is in force")
 
-    def _on_rig(self, message: RigCalibration) -> None:
-        """Know what somebody else has put in force later, so that ``verify`` checks that."""
-        stamp_ns = stamp_from_msg(message.header.stamp)
-        if stamp_ns <= self._since_ns:
-            return
-        calibration = parse_calibration(
-            message.yaml, f"{topics.CALIBRATION.name} ({message.source})"
-        )
-        self._in_force, self._source = calibration, message.source
-        self._since_ns = stamp_ns
+    def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Put a newly named file in force at once; a bad one is refused, the old one stays."""
+        for parameter in parameters:
+            if parameter.name == "calibration_file":
+                try:
+                    calibration = load_calibration(parameter.value)
+                except SlError as error:
+                    return SetParametersResult(successful=False, reason=str(error))
+                self._file = parameter.value
+                self._put_in_force(calibration, self._file, time.time_ns())
+        return SetParametersResult(successful=True)
 
     def health(self) -> Health:
         """What is in force, and what is being done."""
         calibration = self._in_force
-        message = "ready" if calibration else f"ready; {self._fault}"
+        # Without a calibration, or with a spoilt store, the node is ready to calibrate.
+        level = "error" if self._file and not calibration else "ok"
+        message = "ready" if calibration else f"ready; {self._fault or NOT_CALIBRATED}"
         if self._running.locked():
             message = "a run is going on"
         values: dict[str, object] = {
@@ -205,7 +213,7 @@ class CalibrationNode(RigNode):
             "last run": self._last,
             "store": str(self._store.directory),
         }
-        return Health("ok", message, "calibration", str(self._store.directory), values)
+        return Health(level, message, "calibration", str(self._store.directory), values)
 
     def close(self) -> None:
         """End; a run that is going on is cancelled, since the context is gone."""
@@ -215,31 +223,6 @@ class CalibrationNode(RigNode):
         super().close()
 
     # -- calibrate --------------------------------------------------------------------------------
-
-    async def _serve(self, request: Any, response: Any) -> Any:
-        outcome = await self.in_worker(
-            lambda: self._calibrate(request, lambda _: None, self._shutting_down)
-        )
-        return fill(response, outcome)
-
-    async def _execute(self, goal: Any) -> Any:
-        def tell(progress: CalibrationProgress) -> None:
-            goal.publish_feedback(_feedback(progress))
-
-        def cancelled() -> bool:
-            return bool(goal.is_cancel_requested) or self._shutting_down()
-
-        outcome = await self.in_worker(lambda: self._calibrate(goal.request, tell, cancelled))
-        if outcome.cancelled and goal.is_cancel_requested:
-            goal.canceled()
-        elif outcome.success:
-            goal.succeed()
-        else:
-            goal.abort()
-        return fill(CalibrateAction.Result(), outcome)
-
-    def _shutting_down(self) -> bool:
-        return not self.context.ok()
 
     def _calibrate(
         self,
@@ -321,9 +304,9 @@ class CalibrationNode(RigNode):
             asked = VerifyRequest(request.target or "plate", heights_m, self._plate(), sequence)
             in_force = self._stands()
             if in_force is None:
-                raise CalibrationError(f"nothing to verify: {self._fault}")
-            self._await_compiler(self._shutting_down)
-            with self._gear.in_use(self._shutting_down) as gear:
+                raise CalibrationError(f"nothing to verify: {self._fault or NOT_CALIBRATED}")
+            self._await_compiler(self.shutting_down)
+            with self._gear.in_use(self.shutting_down) as gear:
                 return self._calibrator.verify(gear, asked, in_force)
 
         outcome = await self.in_worker(lambda: self._alone(work, VerifyOutcome))
@@ -348,13 +331,9 @@ def fill(response: Any, outcome: Outcome) -> Any:
     return response
 
 
-def _feedback(progress: CalibrationProgress) -> Any:
-    return CalibrateAction.Feedback(
-        stage=progress.stage,
-        view=progress.view,
-        views=progress.views,
-        progress=float(progress.fraction),
-    )
+def _feedback(progress: CalibrationProgress) -> dict[str, Any]:
+    found = asdict(progress)
+    return found | {"progress": float(found.pop("fraction"))}
 
 
 def main(args: list[str] | None = None) -> None:

@@ -61,7 +61,6 @@ class CameraNode(RigNode):
         self._aravis, self._uvc = self._declare_device_options()
         self._make_driver = make_driver or self._make_configured
         self._calibrated: CameraInfo | None = None
-        self._calibrated_ns = 0
         self._full_scale_dn = 0
         self._tell_settings = self.latch_settings(topics.CAMERA_SETTINGS)
         self._statistics = CameraStatistics()
@@ -208,10 +207,7 @@ class CameraNode(RigNode):
             self._tell_settings({**asdict(settings), "full_scale_dn": full_scale_dn})
 
     def _on_calibration(self, message: RigCalibration) -> None:
-        """Take the calibration that came in force last; several nodes latch one."""
-        stamp_ns = stamp_from_msg(message.header.stamp)
-        if stamp_ns >= self._calibrated_ns:
-            self._calibrated, self._calibrated_ns = message.camera, stamp_ns
+        self._calibrated = message.camera
 
     # -- triggering and settings --------------------------------------------------------------
 

@@ -5,7 +5,6 @@ A node never dies of a message: what is wrong with one becomes a count, a log li
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 import sys
@@ -14,7 +13,8 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -31,6 +31,7 @@ from std_msgs.msg import String
 
 from sl_common import topics
 from sl_common.errors import SlError
+from sl_common.messages import interface_class
 from sl_common.topics import Service, Topic
 
 _ResultT = TypeVar("_ResultT")
@@ -72,23 +73,9 @@ _LEVELS = {
 }
 
 
-def next_scan_id(last: int) -> int:
-    """Return a scan number that no scan had, not even before a restart: seconds since 1970 or more.
-
-    It fits the messages' 32 bits until 2106.
-    """
-    return max(last + 1, int(time.time()))
-
-
 def device_health(connected: bool, reason: str) -> tuple[str, str]:
     """Level and message of a node that drives one device."""
     return ("ok", "ready") if connected else ("error", reason)
-
-
-def interface_class(name: str) -> Any:
-    """Class of ``package/msg/Type`` (or ``srv``, ``action``)."""
-    package, kind, member = name.split("/")
-    return getattr(importlib.import_module(f"{package}.{kind}"), member)
 
 
 def qos_profile(topic: Topic) -> QoSProfile:
@@ -128,6 +115,26 @@ class GraphNode(Node):  # type: ignore[misc]  # rclpy carries no types
     def action_client(self, action: Service) -> ActionClient:
         """Return a client of an action."""
         return ActionClient(self, interface_class(action.kind), action.name)
+
+
+class Task(NamedTuple):
+    """Long work that a node does on request.
+
+    Parameters
+    ----------
+    carry_out : callable
+        ``carry_out(request, tell, cancelled)`` works in a worker's thread, calls ``tell`` with its
+        progress, gives up when ``cancelled()``, and returns an outcome with the flags ``success``
+        and ``cancelled``.
+    fill : callable
+        Puts an outcome into a response or a result, and returns that.
+    feedback : callable
+        Fields of the action's feedback for a progress.
+    """
+
+    carry_out: Callable[[Any, Callable[[Any], None], Callable[[], bool]], Any]
+    fill: Callable[[Any, Any], Any]
+    feedback: Callable[[Any], dict[str, Any]]
 
 
 class RigNode(GraphNode):
@@ -240,20 +247,52 @@ class RigNode(GraphNode):
         kind = interface_class(service.kind)
         return self.create_service(kind, service.name, handle, callback_group=self.long_work)
 
-    def serve_action(self, action: Service, execute: Callable[[Any], Any]) -> ActionServer:
-        """Offer an action whose goals may be cancelled.
+    def serve_task(self, service: Service, action: Service, task: Task) -> ActionServer:
+        """Offer long work as a service and as an action of the same meaning.
 
         Parameters
         ----------
-        action : Service
-            What.
-        execute : callable
-            Coroutine that gets the goal's handle and returns its result.
+        service, action : Service
+            Under which it is asked for.
+        task : Task
+            What is done.
+
+        Returns
+        -------
+        ActionServer
+            To be destroyed when the node closes.
         """
+        kind = interface_class(action.kind)
+
+        async def serve(request: Any, response: Any) -> Any:
+            work = partial(task.carry_out, request, lambda _: None, self.shutting_down)
+            return task.fill(response, await self.in_worker(work))
+
+        async def execute(goal: Any) -> Any:
+            def tell(progress: Any) -> None:
+                goal.publish_feedback(kind.Feedback(**task.feedback(progress)))
+
+            def cancelled() -> bool:
+                return bool(goal.is_cancel_requested) or self.shutting_down()
+
+            outcome = await self.in_worker(partial(task.carry_out, goal.request, tell, cancelled))
+            if outcome.success:
+                goal.succeed()
+            elif outcome.cancelled and goal.is_cancel_requested:
+                goal.canceled()
+            else:
+                goal.abort()
+            return task.fill(kind.Result(), outcome)
+
+        self.serve(service, serve)
         return ActionServer(
-            self, interface_class(action.kind), action.name, execute,
+            self, kind, action.name, execute,
             callback_group=self.long_work, cancel_callback=lambda _: CancelResponse.ACCEPT,
         )  # fmt: skip
+
+    def shutting_down(self) -> bool:
+        """Whether the node is about to end: long work is given up then."""
+        return not self.context.ok()
 
     def say(self, text: str) -> None:
         """Log a line, also from a thread that outlives the context by a moment."""

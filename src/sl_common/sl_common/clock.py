@@ -1,4 +1,4 @@
-"""The clock that runs are timed by; tests give another one, which does not sleep."""
+"""The clock that runs are timed by; tests give another one, which does not sleep. Scan numbers."""
 
 from __future__ import annotations
 
@@ -32,3 +32,11 @@ class SystemClock:
             if interrupt.wait(left_ns * 1e-9):
                 return True
         return interrupt.is_set()
+
+
+def next_scan_id(last: int) -> int:
+    """Return a scan number that no scan had, not even before a restart: seconds since 1970 or more.
+
+    It fits the messages' 32 bits until 2106.
+    """
+    return max(last + 1, int(time.time()))

@@ -11,7 +11,8 @@ from typing import Any
 from sl_interfaces.msg import RigCalibration
 
 from sl_common import topics
-from sl_common.base_node import Health, RigNode, device_health, next_scan_id, run
+from sl_common.base_node import Health, RigNode, device_health, run
+from sl_common.clock import next_scan_id
 from sl_common.device_link import DeviceLink
 from sl_common.errors import (
     ConfigError,
@@ -21,7 +22,6 @@ from sl_common.errors import (
     SequenceError,
     SlError,
 )
-from sl_common.messages import stamp_from_msg
 from sl_projector.dlpc.dlpc350_driver import Dlpc350, Dlpc350Settings
 from sl_projector.dlpc.dlpc900_driver import Dlpc900, Dlpc900Settings
 from sl_projector.dlpc.dmd import (
@@ -88,7 +88,6 @@ class ProjectorNode(RigNode):
         self._halted = threading.Event()
         self._showing = ""
         self._last_id = 0
-        self._calibrated_ns = 0
         self._last_run = time.monotonic()
         self._status: ProjectorStatus | None = None
         self._triggers = self.advertise(topics.TRIGGER)
@@ -203,14 +202,8 @@ class ProjectorNode(RigNode):
             self._link.lost(driver, error)
 
     def _on_calibration(self, message: RigCalibration) -> None:
-        """Take the calibration that came in force last; several nodes latch one."""
-        if (stamp_ns := stamp_from_msg(message.header.stamp)) < self._calibrated_ns:
-            return
-        self._calibrated_ns = stamp_ns
-        info = message.projector
-        info.header.frame_id = topics.PROJECTOR_FRAME
-        info.header.stamp = message.header.stamp
-        self._camera_info.publish(info)
+        """Publish the projector of the calibration in force, as an inverse camera."""
+        self._camera_info.publish(message.projector)
 
     async def _project(self, request: Any, response: Any) -> Any:
         if not self._busy.acquire(blocking=False):

@@ -12,26 +12,20 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields
-from pathlib import Path
+from dataclasses import asdict, fields
 from typing import Any
 
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.parameter import Parameter
-from sl_interfaces.action import Scan
-from sl_interfaces.msg import MatchedFrame, PatternStack, RigCalibration, ScanReport
+from sl_interfaces.msg import PatternStack, ScanReport
 
 from sl_common import topics
-from sl_common.base_node import Health, RigNode, next_scan_id, run
+from sl_common.base_node import Health, RigNode, Task, run
 from sl_common.errors import CalibrationError, ConfigError, SlError, StackError
-from sl_common.messages import stamp_from_msg
 from sl_projector.sequence.messages import image_to_msg, stack_from_msg
 from sl_projector.sequence.stack import Stack
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.measure_service_node import MeasureService
-from sl_reconstruct.messages import cloud_to_msg, frames_of, report_to_msg, rig_to_msg
-from sl_reconstruct.model.calibration_file import Calibration, load_calibration, parse_calibration
-from sl_reconstruct.projector_client_node import ProjectorClient
+from sl_reconstruct.messages import cloud_to_msg, frames_of, report_to_msg
+from sl_reconstruct.model.calibration_file import parse_calibration
 from sl_reconstruct.reconstruction.reconstructor_cache import (
     Workshop,
     compile_apart,
@@ -44,10 +38,9 @@ from sl_reconstruct.scan.scan_flow import (
     ScanProgress,
     ScanRequest,
     ScanResult,
-    ScanRun,
     ScanTimeouts,
-    ScanWatch,
 )
+from sl_reconstruct.scan.stack_client import StackClient
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -56,6 +49,7 @@ except ImportError:  # tf2 is not among the wheels; the poses are on calibration
 
 #: Stacks that may wait while one is being worked on; more would fill the memory.
 MAX_WAITING = 2
+NO_CALIBRATION = "no calibration is in force: run 'slrig calibrate' or name a file (--calibration)"
 #: What most rigs do not need at once is compiled when the node has run so long: not in the first
 #: minutes, in which everybody waits for something else.
 REST_AFTER_S = 180.0
@@ -85,35 +79,26 @@ class ReconstructNode(RigNode):
         self._waiting = threading.Semaphore(MAX_WAITING + 1)
         self._stacks: deque[tuple[Stack, int]] = deque()
         self._scanning = threading.Lock()
-        self._watch: ScanWatch | None = None
-        self._last_id = 0
         self._ready = False
-        self._in_force_since_ns = 0
-        self._calibration_fault = "no calibration yet"
+        self._calibration_fault = ""
         self._last = "no stack yet"
         self._clouds = self.advertise(topics.POINTS)
         self._refusals = self.advertise(topics.REFUSALS)
         self._reports = self.advertise(topics.REPORT)
-        self._rigs = self.advertise(topics.CALIBRATION)
         self.latch_settings(topics.SETTINGS)(self._workshop.settings.to_dict())
         self._frames = self.advertise(topics.TF_STATIC) if TFMessage else None
-        self.listen(topics.CALIBRATION, self._on_rig)
-        self.listen(topics.FRAME, self._on_frame)
+        self.listen(topics.CALIBRATION, self._on_calibration)
+        self._client = StackClient(self, self._gap)
+        self.listen(topics.FRAME, self._client.on_frame)
         self.listen(topics.STACK, self._on_stack)
-        self._offer_scan()
+        task = Task(self._scan, self._fill, _feedback)
+        self._action = self.serve_task(topics.SCAN, topics.SCAN_ACTION, task)
         self._measuring = MeasureService(self)
-        self.add_on_set_parameters_callback(self._on_parameters)
         self._compiler = None if compiled() else compile_apart()
         self._worker.submit(self._warm_up)
         self._rest = self.create_timer(REST_AFTER_S, self._compile_rest, clock=self.steady)
 
-    def _offer_scan(self) -> None:
-        self._projector = ProjectorClient(self)
-        self.serve(topics.SCAN, self._serve_scan)
-        self._action = self.serve_action(topics.SCAN_ACTION, self._execute_scan)
-
     def _declare_parameters(self) -> None:
-        self._file = self.declare("calibration_file", "", "calibration of the rig", live=True)
         self.declare("max_repeats", 2, "how often a spoilt scan is repeated", 0, 254, live=True)
         default = ScanTimeouts()
         self._timeouts = ScanTimeouts(
@@ -143,7 +128,8 @@ class ReconstructNode(RigNode):
         """Whether a scan could be made."""
         level, message = "ok", "ready"
         if not self._workshop.calibration_hash:
-            level, message = ("error" if self._file else "warn"), self._calibration_fault
+            level = "error" if self._calibration_fault else "warn"
+            message = self._calibration_fault or NO_CALIBRATION
         elif not self._ready:
             level, message = "warn", "compiling; scans wait"
         values: dict[str, object] = {
@@ -153,7 +139,7 @@ class ReconstructNode(RigNode):
             "last stack": self._last,
             "scanning": self._scanning.locked(),
         }
-        return Health(level, message, "reconstruction", self._file, values)
+        return Health(level, message, "reconstruction", values=values)
 
     def close(self) -> None:
         """Let the stack that is being worked on end, forget the others."""
@@ -169,9 +155,7 @@ class ReconstructNode(RigNode):
             self._compiler.wait()
 
     def _warm_up(self) -> None:
-        """Compile before the first stack comes; then the calibration, so that ready means ready."""
-        if self._file:
-            self._read_calibration()
+        """Compile before the first stack comes."""
         try:
             if self._compiler is not None:
                 self._compiler.wait()
@@ -180,9 +164,7 @@ class ReconstructNode(RigNode):
         except Exception as error:  # the first real stack will say it again
             self.get_logger().error(f"warm-up failed: {error!r}")
         self._ready = True
-        self.get_logger().info(
-            "ready" if self._workshop.calibration_hash else self._calibration_fault
-        )
+        self.get_logger().info("ready" if self._workshop.calibration_hash else NO_CALIBRATION)
 
     def _compile_rest(self) -> None:
         """Compile row patterns and 16-bit images apart, once and while nobody scans."""
@@ -193,67 +175,31 @@ class ReconstructNode(RigNode):
 
     # -- calibration --------------------------------------------------------------------------
 
-    def _read_calibration(self) -> None:
-        """Put the file's calibration in force; a bad one is told and changes nothing."""
+    def _on_calibration(self, message: Any) -> None:
+        """Take what the calibration node (or the player of a recording) says is in force."""
+        if message.hash == self._workshop.calibration_hash:
+            return
+        source = f"{topics.CALIBRATION.name} ({message.source})"
         try:
-            path = Path(self._file)
-            calibration = load_calibration(path)
-            self._put_in_force(calibration, str(path), path.stat().st_mtime_ns)
-        except (SlError, OSError) as error:
+            calibration = parse_calibration(message.yaml, source)
+            if calibration.hash != message.hash:
+                raise CalibrationError(
+                    f"{source} says hash {message.hash[:12]}, its document has "
+                    f"{calibration.hash[:12]}; expected the same"
+                )
+        except SlError as error:
             self._calibration_fault = str(error)
-            self.complain("calibration_file", error)
-
-    def _put_in_force(self, calibration: Calibration, source: str, stamp_ns: int) -> None:
+            raise
         self._workshop.calibrate(calibration)
-        self._in_force_since_ns = stamp_ns
         self._calibration_fault = ""
-        self._rigs.publish(rig_to_msg(calibration, source, stamp_ns))
         if self._frames is not None:
             self._frames.publish(TFMessage(transforms=frames_of(calibration.rig)))
-        self.get_logger().info(f"calibration {calibration.hash[:12]} of {source} is in force")
-
-    def _on_rig(self, message: RigCalibration) -> None:
-        """Take the calibration that came in force last, whoever published it."""
-        stamp_ns = stamp_from_msg(message.header.stamp)
-        if message.hash == self._workshop.calibration_hash or stamp_ns <= self._in_force_since_ns:
-            return
-        calibration = parse_calibration(
-            message.yaml, f"{topics.CALIBRATION.name} ({message.source})"
-        )
-        if calibration.hash != message.hash:
-            raise CalibrationError(
-                f"{topics.CALIBRATION.name} says hash {message.hash[:12]}, its document has "
-                f"{calibration.hash[:12]}; expected the same"
-            )
-        self._put_in_force(calibration, message.source, stamp_ns)
-
-    def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Read a new calibration file at once; a bad one is refused, the old one stays."""
-        for parameter in parameters:
-            if parameter.name == "calibration_file":
-                try:
-                    calibration = load_calibration(parameter.value)
-                except SlError as error:
-                    return SetParametersResult(successful=False, reason=str(error))
-                self._file = parameter.value
-                self._put_in_force(calibration, self._file, time.time_ns())
-        return SetParametersResult(successful=True)
+        self.get_logger().info(f"calibration {message.hash[:12]} of {message.source} is in force")
 
     # -- stacks -------------------------------------------------------------------------------
 
-    def _on_frame(self, message: MatchedFrame) -> None:
-        watch = self._watch
-        if watch is None or message.scan_id != watch.scan_id:
-            return
-        if message.status == MatchedFrame.MATCHED:
-            watch.matched(message.index, message.count)
-        elif message.status in (MatchedFrame.STACK_COMPLETE, MatchedFrame.STACK_REFUSED):
-            watch.decided(message.status == MatchedFrame.STACK_COMPLETE, message.reason)
-        else:
-            watch.sign()
-
     def _on_stack(self, message: PatternStack) -> None:
-        watch = self._watch_of(message.scan_id)
+        watch = self._client.watch_of(message.scan_id)
         if watch is None and not self._clouds.get_subscription_count():
             self._last = f"scan {message.scan_id}: not asked for here, and nobody listens"
             return
@@ -274,12 +220,8 @@ class ReconstructNode(RigNode):
         self._stacks.append((stack, came_ns))
         self._worker.submit(self._process)
 
-    def _watch_of(self, scan_id: int) -> ScanWatch | None:
-        watch = self._watch
-        return watch if watch is not None and watch.scan_id == scan_id else None
-
     def _finish(self, scan_id: int, result: Any) -> None:
-        if watch := self._watch_of(scan_id):
+        if watch := self._client.watch_of(scan_id):
             watch.finished(result)
 
     def _process(self) -> None:
@@ -301,10 +243,8 @@ class ReconstructNode(RigNode):
             self._waiting.release()
 
     def _reconstruct(self, stack: Stack, came_ns: int) -> ScanReport:
-        if not self._workshop.calibration_hash and self._file:
-            self._read_calibration()
         if not self._workshop.calibration_hash:
-            raise CalibrationError(f"no calibration is in force: {self._calibration_fault}")
+            raise CalibrationError(self._calibration_fault or NO_CALIBRATION)
         began_s = time.perf_counter()
         # The images are let go before the cloud is published, which needs as much memory again.
         product = self._workshop(stack.release_images(), stack.sequence)
@@ -329,46 +269,19 @@ class ReconstructNode(RigNode):
 
     # -- scans --------------------------------------------------------------------------------
 
-    async def _serve_scan(self, request: Any, response: Any) -> Any:
-        result = await self.in_worker(
-            lambda: self._scan(request, lambda _: None, self._shutting_down)
-        )
-        return self._fill(response, result)
-
-    async def _execute_scan(self, goal: Any) -> Any:
-        def tell(progress: ScanProgress) -> None:
-            goal.publish_feedback(_feedback(progress))
-
-        def cancelled() -> bool:
-            return bool(goal.is_cancel_requested) or self._shutting_down()
-
-        result = await self.in_worker(lambda: self._scan(goal.request, tell, cancelled))
-        if result.success:
-            goal.succeed()
-        elif result.cancelled and goal.is_cancel_requested:
-            goal.canceled()
-        else:
-            goal.abort()
-        return self._fill(Scan.Result(), result)
-
-    def _shutting_down(self) -> bool:
-        return not self.context.ok()
-
     def _scan(
         self, request: Any, tell: Callable[[ScanProgress], None], cancelled: Callable[[], bool]
     ) -> ScanResult:
         if not self._scanning.acquire(blocking=False):
             return ScanResult(False, "a scan is running already; wait for it or cancel it")
         try:
-            run_ = ScanRun(self, self._order(request), tell, cancelled, self._timeouts)
-            return run_.run()
+            return self._client.take(self._order(request), tell, cancelled, self._timeouts)
         except ConfigError as error:
             return ScanResult(False, str(error))
         except Exception as error:  # the caller gets an answer whatever happens
             self.get_logger().error(f"scan failed: {error!r}")
             return ScanResult(False, f"internal fault: {error!r}")
         finally:
-            self._watch = None
             self._scanning.release()
 
     def _order(self, request: Any) -> ScanRequest:
@@ -394,50 +307,13 @@ class ReconstructNode(RigNode):
             self.get_logger().error(f"scan failed: {result.message}")
         return response
 
-    # -- what a scan needs of the graph (`scan_flow.ScanDevices`) -----------------------
-
-    def begin(self) -> ScanWatch:
-        """Take a number that no scan had."""
-        self._last_id = next_scan_id(self._last_id)
-        self._watch = ScanWatch(self._last_id)
-        return self._watch
-
-    def missing(self, patience_s: float) -> str:
-        """Name what a scan cannot do without and nobody offers, even after a while."""
-        deadline_s = time.monotonic() + patience_s
-        while (gap := self._gap()) and time.monotonic() < deadline_s and self.context.ok():
-            time.sleep(0.05)
-        return gap
-
     def _gap(self) -> str:
-        if gap := self._projector.gap():
-            return gap
-        for topic in (topics.IMAGE, topics.STACK):
-            if not self.count_publishers(topic.name):
-                return f"nobody publishes {topic.name}: is the {topic.node} node running?"
-        if self._ready and not self._workshop.calibration_hash and not self._file:
-            return (
-                "no calibration is in force: run 'slrig calibrate' or name a file (--calibration)"
-            )
-        return ""
-
-    def project(self, watch: ScanWatch, order: ScanRequest) -> None:
-        """Ask the projector; the watch is told when it has answered."""
-        self._projector.project(watch, order)
-
-    def stop_projecting(self) -> None:
-        """Ask the projector to stop; its answer is of no interest."""
-        self._projector.stop()
+        """Say what a scan lacks here; see `StackClient`."""
+        return NO_CALIBRATION if self._ready and not self._workshop.calibration_hash else ""
 
 
-def _feedback(progress: ScanProgress) -> Any:
-    return Scan.Feedback(
-        stage=progress.stage,
-        attempt=progress.attempt,
-        frames=progress.frames,
-        count=progress.count,
-        progress=float(progress.fraction),
-    )
+def _feedback(progress: ScanProgress) -> dict[str, Any]:
+    return asdict(progress) | {"progress": float(progress.fraction)}
 
 
 def main(args: list[str] | None = None) -> None:

@@ -19,7 +19,8 @@ def add_parser(subparsers: Any) -> None:
         help="publish a recording as the devices did",
         description="Publish triggers, images, poses and calibration of a recording with their "
         "timing, and the time on /clock. It begins when somebody listens. Nodes that shall live "
-        "in the recording's time get use_sim_time. synchronizer and reconstruct make stacks and "
+        "in the recording's time get use_sim_time. A calibration in force in the graph stays so, "
+        "and the recording's is not played. synchronizer and reconstruct make stacks and "
         "clouds of a replay as of a live scan; nobody asked for them by `slrig scan`, so "
         "reconstruct makes them only while somebody subscribes to reconstruct/points. Do not "
         "replay into a graph whose own devices run. The exit status is 0 only when the bag was "

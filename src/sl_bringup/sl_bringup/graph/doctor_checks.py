@@ -143,14 +143,10 @@ def configuration(options: GraphOptions) -> list[Finding]:
     found = [Finding("ok", "configuration", str(options.source))]
     if options.bench:
         return found
-    sections = yaml.safe_load(config.read_text())
-    parameters = {
-        name: sections.get(f"{options.changes.namespace}/{name}", {}).get("ros__parameters", {})
-        for name in ("calibration", "reconstruct")
-    }
-    named = [str(p["calibration_file"]) for p in parameters.values() if p.get("calibration_file")]
-    store = parameters["calibration"].get("store_dir")
-    return [*found, _calibration(named[0] if named else _accepted(store))]
+    section = yaml.safe_load(config.read_text()).get(f"{options.changes.namespace}/calibration", {})
+    parameters = section.get("ros__parameters", {})
+    named = str(parameters.get("calibration_file") or _accepted(parameters.get("store_dir")))
+    return [*found, _calibration(named)]
 
 
 def _accepted(store_dir: str | None) -> str:

@@ -31,8 +31,7 @@ NODES = {
 }
 #: What a rig may do without: without a section of its own in the file it is not started.
 OPTIONAL = ("camera", "stage")
-#: Sections that may name a calibration file; the graph's is the calibration node's.
-CALIBRATED = ("/sl/calibration", "/sl/reconstruct")
+CALIBRATION, RECONSTRUCT = "/sl/calibration", "/sl/reconstruct"
 RUNTIME_VARIABLE = "$(var runtime_dir)"
 TRUE_RIG = "true_rig.yaml"
 
@@ -125,16 +124,19 @@ def write_config(source: Path, directory: Path, changes: Changes) -> Path:
     """
     text = read_text(source, ConfigError).replace(RUNTIME_VARIABLE, str(directory))
     document = _checked(parse_document(text, str(source), ConfigError), source)
-    for section in CALIBRATED:
-        _resolve(document, section, "calibration_file", source.parent)
-    _resolve(document, CALIBRATED[0], "store_dir", source.parent)
+    if "calibration_file" in document.get(RECONSTRUCT, {}).get("ros__parameters", {}):
+        raise ConfigError(
+            f"{source}: {RECONSTRUCT} names a calibration_file; expected it in {CALIBRATION}, the "
+            "only node that says which calibration is in force"
+        )
+    for name in ("calibration_file", "store_dir"):
+        _resolve(document, CALIBRATION, name, source.parent)
     if document.get(BENCH, {}).get("ros__parameters", {}).get("rig") != "reference":
         _resolve(document, BENCH, "rig", source.parent)
     if changes.calibration or changes.uncalibrated:
-        for section in CALIBRATED:
-            document.get(section, {}).get("ros__parameters", {}).pop("calibration_file", None)
+        document.get(CALIBRATION, {}).get("ros__parameters", {}).pop("calibration_file", None)
     if changes.calibration:
-        set_parameter(document, CALIBRATED[0], "calibration_file", changes.calibration)
+        set_parameter(document, CALIBRATION, "calibration_file", changes.calibration)
     if changes.surface:
         set_parameter(document, BENCH, "surface", changes.surface)
     _tell_full_scale(document)
@@ -153,9 +155,9 @@ def _tell_full_scale(document: dict[str, Any]) -> None:
     """Let the reconstruction know where 10 and 12 bits end that come in 16-bit images."""
     camera = document.get("/sl/camera", {}).get("ros__parameters", {})
     bits = PIXEL_BITS.get(camera.get("pixel_format", "mono8"), 16)
-    reconstruct = document.get("/sl/reconstruct", {}).get("ros__parameters", {})
+    reconstruct = document.get(RECONSTRUCT, {}).get("ros__parameters", {})
     if bits not in (8, 16) and not reconstruct.get("saturation_dn"):
-        set_parameter(document, "/sl/reconstruct", "saturation_dn", (1 << bits) - 1)
+        set_parameter(document, RECONSTRUCT, "saturation_dn", (1 << bits) - 1)
 
 
 def _checked(document: Any, source: Path) -> dict[str, Any]:
