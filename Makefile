@@ -13,10 +13,12 @@ INTERFACES := $(shell find src/sl_interfaces -type f)
 PACKAGES := sl_common sl_projector sl_camera sl_reconstruct sl_calibration sl_bench sl_bringup
 SOURCES := $(foreach p,$(PACKAGES),src/$(p)/$(p))
 PYTEST := $(BIN)/python -m pytest
+# Extras of pyproject.toml that are installed; continuous integration adds some (.ci/run).
+EXTRAS := ros,dev
 
 export MYPYPATH := $(subst $() ,:,$(foreach p,$(PACKAGES),src/$(p)))
 
-.PHONY: help scan test check paper bench venv clean distclean
+.PHONY: help scan test check types docs wheel workspace paper bench venv clean distclean
 .DEFAULT_GOAL := help
 
 help: ## this text
@@ -31,8 +33,21 @@ test: venv ## install, run all tests
 check: venv ## style, types, import directions: under a minute
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
-	@$(BIN)/mypy $(SOURCES)
+	@$(MAKE) --no-print-directory types
 	@$(PYTEST) -q tests/common/test_architecture.py
+
+types: venv ## types alone
+	@$(BIN)/mypy $(SOURCES)
+
+docs: $(STAMPS)/docs ## the manual and the API as a site in output/site; a warning is an error
+	@$(BIN)/python -m mkdocs build --quiet --site-dir $(OUTPUT)/site
+	@echo "the site is in $(OUTPUT)/site/index.html"
+
+wheel: venv ## the wheels, tried in an environment and a folder of their own
+	@.ci/wheel
+
+workspace: ## colcon build of all packages; every node starts from the workspace
+	@.ci/workspace
 
 paper: venv ## the paper's Table 2 and Figs. 10 and 11 on the bench, beside the paper's numbers
 	@$(BIN)/python benchmarks/paper/reproduce.py --output $(OUTPUT)/paper
@@ -60,7 +75,12 @@ $(STAMPS)/python:
 # These two run side by side: one waits for downloads while the other compiles.
 $(STAMPS)/runtime: pyproject.toml $(STAMPS)/python
 	@echo "installing the runtime, ROS 2 and the tools"
-	@$(PIP) install -e '.[ros,dev]'
+	@$(PIP) install -e '.[$(EXTRAS)]'
+	@touch $@
+
+$(STAMPS)/docs: pyproject.toml $(STAMPS)/installed
+	@echo "installing what the site is built with"
+	@$(PIP) install -e '.[docs]'
 	@touch $@
 
 $(STAMPS)/wheel: $(INTERFACES) $(STAMPS)/python
