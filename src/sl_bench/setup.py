@@ -8,7 +8,6 @@ from setuptools import find_packages, setup
 MANIFEST = ElementTree.parse("package.xml").getroot()
 NAME = MANIFEST.findtext("name")
 MAINTAINER = MANIFEST.find("maintainer")
-NODES = ["bench"]
 
 setup(
     name=NAME,
@@ -25,5 +24,5 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},
     zip_safe=False,
-    entry_points={"console_scripts": [f"{n} = {NAME}.{n}:main" for n in NODES]},
+    entry_points={"console_scripts": ["bench = sl_bench.process.bench:main"]},
 )
