@@ -8,7 +8,7 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-DATA = ("config/*.yaml", "udev/*.rules")
+DATA = ("config/*.yaml",)
 
 
 def expected() -> set[str]:

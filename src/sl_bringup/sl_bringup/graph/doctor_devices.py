@@ -37,7 +37,7 @@ SERIAL_NAMES = Path("/dev/serial/by-id")
 RULES_DIRECTORIES = tuple(
     map(Path, ("/etc/udev/rules.d", "/run/udev/rules.d", "/lib/udev/rules.d"))
 )
-RULES = Path(sl_projector.__file__).parents[1] / "udev" / "60-sl-projector.rules"
+RULES = Path(sl_projector.__file__).parent / "udev" / "60-sl-projector.rules"
 RELOAD = (
     "sudo udevadm control --reload && sudo udevadm trigger, then unplug it and plug it in again"
 )
