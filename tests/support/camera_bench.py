@@ -21,7 +21,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sl_bench.camera.camera_emulator import CameraEmulator, Execute, Exposure
+from sl_bench.camera.camera_emulator import CameraEmulator, Exposure
+from sl_bench.camera.endpoint import Execute
 from sl_bench.camera.gige_camera import GigeCamera
 from sl_bringup.bag.bag_writer import new_bag
 from sl_camera.camera.camera import CameraDriver

@@ -1,7 +1,7 @@
-"""The emulated camera: exposes the bench's world on each edge of its trigger line.
+"""The emulated camera: exposes the bench's world at each edge of its trigger line.
 
-Edge, shutter, rendering and delivery are a chain of queues, so rendering that takes longer than
-an exposure delays frames but never changes what is on them, their stamps or their order.
+Edge, shutter, rendering and delivery are a chain of queues: rendering that takes longer than an
+exposure delays frames but never changes what is on them, their stamps or their order.
 """
 
 from __future__ import annotations
@@ -13,15 +13,16 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_bench.camera.camera_faults import CameraFaults
 from sl_bench.camera.camera_server import CameraServer
+from sl_bench.camera.endpoint import Endpoint, Execute
 from sl_camera.camera.camera import CameraSettings, PixelFormat
 from sl_camera.drivers import socket_protocol as wire
 from sl_common.errors import DeviceRefused
@@ -29,15 +30,16 @@ from sl_common.errors import DeviceRefused
 Mirrors = NDArray[np.bool_]
 Position = tuple[float, float, float]
 
-#: A frame to be swapped with the next one is delivered after so long when there is no next one.
+#: A frame to be swapped with the next one is delivered after this time when there is none.
 SWAP_WAIT_S = 0.3
-#: An edge may come so much (as a fraction) before the camera is ready again: clocks are not exact.
+#: An edge may come early by this fraction of the frame time: clocks are not exact.
 READY_SLACK = 0.005
-#: Frames of an earlier sequence that are so late are not rendered: who began another has given
-#: them up. A slow machine would else be busy with them for ever, and late again with the next.
+#: Frames of an earlier sequence that are later than this are not rendered: nobody waits for them
+#: any more, and a slow machine would be late again with the next sequence.
 GIVEN_UP_S = 5.0
 #: Exposures of the DMD that are remembered, to integrate over.
 HISTORY = 256
+_POLL_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -63,27 +65,6 @@ class Exposure:
 
 
 Render = Callable[[Exposure], NDArray[Any]]
-Execute = Callable[[dict[str, Any]], dict[str, Any] | None]
-
-
-class Endpoint(Protocol):
-    """What carries commands to the camera and frames from it."""
-
-    def start(self) -> None:
-        """Serve from here on."""
-        ...
-
-    def close(self) -> None:
-        """Serve no more."""
-        ...
-
-    def disconnect(self, seconds: float) -> None:
-        """Be gone for a while."""
-        ...
-
-    def send(self, header: wire.Header, pixels: NDArray[Any]) -> None:
-        """Deliver one frame."""
-        ...
 
 
 @dataclass
@@ -100,12 +81,15 @@ class _Job:
         return self.start_ns + round(self.settings.exposure_s * 1e9)
 
 
-@dataclass(order=True)
+@dataclass
 class _Delivery:
     due_ns: int
     order: int
-    header: wire.Header = field(compare=False)
-    pixels: NDArray[Any] = field(compare=False)
+    header: wire.Header
+    pixels: NDArray[Any]
+
+    def __lt__(self, other: _Delivery) -> bool:
+        return (self.due_ns, self.order) < (other.due_ns, other.order)
 
 
 class CameraEmulator:
@@ -114,15 +98,14 @@ class CameraEmulator:
     Parameters
     ----------
     endpoint : path or callable
-        Its socket; or ``endpoint(execute)`` makes what serves it otherwise (`CameraServer`,
-        `sl_bench.camera.gige_camera.GigeCamera`).
+        Its socket (`CameraServer`); or ``endpoint(execute)`` makes another `Endpoint`.
     render : callable
         ``render(exposure) -> image`` of the whole sensor, called from one thread.
     image_size : tuple of int
         (width, height) of the sensor, pixels.
     stage_m : callable
-        ``stage_m(time_ns) -> position``: where the stage stood then, metres; host clock. A
-        shutter that is served late on a busy machine must not see where the stage went since.
+        ``stage_m(time_ns) -> position``: where the stage stood at a time of the host's clock,
+        metres: on a busy machine the shutter may look late.
     mirrors_now : callable
         What the DMD shows now, for frames that are not triggered by it.
     max_rate_hz : float
@@ -194,12 +177,12 @@ class CameraEmulator:
                 thread.join()
 
     def disconnect(self, seconds: float) -> None:
-        """Be unplugged for a while; afterwards it is idle and must be configured again."""
+        """Be unplugged for some seconds; afterwards it is idle and must be configured again."""
         self._idle()
         self._server.disconnect(seconds)
 
     def state(self) -> dict[str, object]:
-        """Return what the control socket tells about the camera."""
+        """Return what the control socket reports about the camera."""
         return {
             "armed": self._armed,
             "trigger": self._settings.trigger,
@@ -234,12 +217,11 @@ class CameraEmulator:
                 f"{self._pixel_format} only"
             )
         width, height = self._image_size
-        if settings.region is not None:
-            x, y, w, h = settings.region
-            if x + w > width or y + h > height:
-                raise DeviceRefused(
-                    f"region {settings.region} is not on the sensor of {width} x {height}"
-                )
+        x, y, w, h = settings.region or (0, 0, 0, 0)
+        if x + w > width or y + h > height:
+            raise DeviceRefused(
+                f"region {settings.region} is not on the sensor of {width} x {height}"
+            )
         self._idle()
         self._settings = settings
 
@@ -257,7 +239,19 @@ class CameraEmulator:
     # -- edges ------------------------------------------------------------------------------
 
     def on_exposure(self, mirrors: Mirrors, index: int, start_ns: int, exposure_s: float) -> None:
-        """Take the DMD's trigger edge; quick, called from the DMD's thread at the edge."""
+        """Take the DMD's trigger edge; quick, called from the DMD's thread at the edge.
+
+        Parameters
+        ----------
+        mirrors : ndarray, (rows, columns) bool
+            What the DMD shows.
+        index : int
+            Number of the exposure in the DMD's run.
+        start_ns : int
+            Time of the edge, host clock.
+        exposure_s : float
+            For how long the DMD shows it.
+        """
         if not self._shown or self._shown[-1][0] != start_ns:  # a doubled edge is no more light
             self._shown.append((start_ns, exposure_s, mirrors))
         if index == 0:
@@ -270,7 +264,7 @@ class CameraEmulator:
         with self._lock:
             if not self._armed:
                 return
-            busy_s = max(self._frame_time_s, self._settings.exposure_s) * (1 - READY_SLACK)
+            busy_s = self._busy_s() * (1 - READY_SLACK)
             too_early = 0 <= start_ns - self._last_start_ns < busy_s * 1e9
             faults = frozenset() if too_early else self.faults.next_frame()
             if too_early or "lost_trigger" in faults:
@@ -283,13 +277,21 @@ class CameraEmulator:
                 _Job(frame_id, start_ns, settings, generation, faults, self._stage_m(start_ns))
             )
 
+    def _busy_s(self) -> float:
+        """Shortest time between frames."""
+        return max(self._frame_time_s, self._settings.exposure_s)
+
+    @property
+    def _free_running(self) -> bool:
+        return self._armed and self._settings.trigger == "free"
+
     def _shutter_loop(self) -> None:
         """Wait for the end of each exposure, and see where the stage is then."""
         while not self._stop.is_set():
             try:
                 job = self._exposing.get(timeout=self._idle_wait_s())
             except queue.Empty:
-                if self._armed and self._settings.trigger == "free":
+                if self._free_running:
                     self._expose(time.time_ns())
                 continue
             self._stop.wait(max(0.0, (job.end_ns - time.time_ns()) * 1e-9))
@@ -299,17 +301,17 @@ class CameraEmulator:
             self._rendering.put(job)
 
     def _idle_wait_s(self) -> float:
-        if self._armed and self._settings.trigger == "free":
-            since_s = (time.time_ns() - self._last_start_ns) * 1e-9
-            return max(0.001, max(self._frame_time_s, self._settings.exposure_s) - since_s)
-        return 0.05
+        if not self._free_running:
+            return _POLL_S
+        since_s = (time.time_ns() - self._last_start_ns) * 1e-9
+        return max(0.001, self._busy_s() - since_s)
 
     # -- frames -----------------------------------------------------------------------------
 
     def _render_loop(self) -> None:
         while not self._stop.is_set():
             try:
-                job = self._rendering.get(timeout=0.05)
+                job = self._rendering.get(timeout=_POLL_S)
             except queue.Empty:
                 continue
             if job.generation == self._generation and not self._given_up(job):
@@ -349,27 +351,26 @@ class CameraEmulator:
         return shown
 
     def _post(self, job: _Job, image: NDArray[Any]) -> None:
-        stamp_ns = job.start_ns
-        if "stamp" in job.faults:
-            stamp_ns += round(self.faults.stamp_s * 1e9)
         height, width = image.shape
         header = wire.Header(
-            wire.FRAME, image.nbytes, image.itemsize, width, height, job.frame_id, stamp_ns,
+            wire.FRAME,
+            image.nbytes // 2 if "incomplete" in job.faults else image.nbytes,
+            image.itemsize,
+            width,
+            height,
+            job.frame_id,
+            job.start_ns + ("stamp" in job.faults) * round(self.faults.stamp_s * 1e9),
             job.settings.exposure_s,
-        )  # fmt: skip
-        if "incomplete" in job.faults:
-            header = replace(header, payload=header.payload // 2)
+        )
         due_ns = max(job.end_ns + self._readout_ns, time.time_ns())
-        if "delay" in job.faults:
-            due_ns += round(self.faults.delay_s * 1e9)
+        due_ns += ("delay" in job.faults) * round(self.faults.delay_s * 1e9)
         with self._lock:
-            if job.generation != self._generation:
-                return
-            self._outbox.post(header, image, due_ns, job.faults)
+            if job.generation == self._generation:
+                self._outbox.post(header, image, due_ns, job.faults)
 
     def _delivery_loop(self) -> None:
         while not self._stop.is_set():
-            delivery = self._outbox.next_due(0.05)
+            delivery = self._outbox.next_due(_POLL_S)
             if delivery is not None:
                 self._server.send(delivery.header, delivery.pixels)
 

@@ -4,14 +4,9 @@ from __future__ import annotations
 
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 from sl_common.errors import ConfigError
-
-KINDS = (
-    "drop", "duplicate", "swap", "delay", "stamp", "lost_trigger", "wrong_size", "saturate",
-    "incomplete",
-)  # fmt: skip
 
 
 @dataclass
@@ -36,7 +31,7 @@ class CameraFaults:
     Raises
     ------
     ConfigError
-        When a probability is not between 0 and 1, or `at` names no fault.
+        When a probability is not between 0 and 1, or ``at`` names no fault.
     """
 
     seed: int = 0
@@ -73,3 +68,7 @@ class CameraFaults:
             for kind in KINDS
             if chance[kind] < getattr(self, kind) or self._frame in self.at.get(kind, ())
         )
+
+
+#: Every fault that may happen to a frame.
+KINDS = tuple(f.name for f in fields(CameraFaults) if f.default == 0.0 and f.name != "seed")

@@ -6,23 +6,22 @@ import contextlib
 import json
 import socket
 import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sl_bench.camera.endpoint import Endpoint, Execute
 from sl_camera.drivers import socket_protocol as wire
 from sl_common.errors import SlError
 
-#: A client that does not read for so long is thrown out.
+#: A client that does not read for this long is disconnected.
 SEND_TIMEOUT_S = 5.0
 _POLL_S = 0.1
 
 
-class CameraServer:
+class CameraServer(Endpoint):
     """Answers commands and sends frames.
 
     Parameters
@@ -30,62 +29,35 @@ class CameraServer:
     path : path
         The socket; made by `start`, removed by `close`.
     execute : callable
-        ``execute(command) -> reply``, both dictionaries; None where the command has no reply.
-        A `SlError` becomes a refusal.
+        See `Endpoint`.
     """
 
-    def __init__(
-        self, path: str | Path, execute: Callable[[dict[str, Any]], dict[str, Any] | None]
-    ) -> None:
+    def __init__(self, path: str | Path, execute: Execute) -> None:
+        super().__init__(execute, "camera server")
         self._path = Path(path)
-        self._execute = execute
         self._client: socket.socket | None = None
         self._send_lock = threading.Lock()
-        self._stop = threading.Event()
-        self._gone_until = 0.0
         self._listener: socket.socket | None = None
-        self._thread = threading.Thread(target=self._loop, name="camera server", daemon=True)
-
-    def start(self) -> None:
-        """Accept clients from here on."""
-        self._listener = self._listen()
-        self._thread.start()
-
-    def close(self) -> None:
-        """Throw the client out and remove the socket."""
-        self._stop.set()
-        self._hang_up()
-        if self._thread.is_alive():
-            self._thread.join()
-        self._unlisten()
-
-    def disconnect(self, seconds: float) -> None:
-        """Be gone for a while, as if unplugged."""
-        self._gone_until = time.monotonic() + seconds
-        self._hang_up()
 
     def send(self, header: wire.Header, pixels: NDArray[Any]) -> None:
-        """Send one frame, whole or (where the header says so) cut; nothing without a client."""
+        """See `Endpoint`."""
         data = memoryview(np.ascontiguousarray(pixels).reshape(-1).view(np.uint8).data)
         self._write(header.pack(), data[: header.payload])
 
-    # -- inside -----------------------------------------------------------------------------
-
-    def _listen(self) -> socket.socket:
+    def _open(self) -> None:
         self._path.unlink(missing_ok=True)
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        listener.bind(str(self._path))
-        listener.listen(1)
-        listener.settimeout(_POLL_S)
-        return listener
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._listener.bind(str(self._path))
+        self._listener.listen(1)
+        self._listener.settimeout(_POLL_S)
 
-    def _unlisten(self) -> None:
+    def _shut(self) -> None:
         listener, self._listener = self._listener, None
         if listener is not None:
             listener.close()
             self._path.unlink(missing_ok=True)
 
-    def _hang_up(self) -> None:
+    def _drop_host(self) -> None:
         client = self._client
         if client is not None:
             with contextlib.suppress(OSError):
@@ -100,16 +72,17 @@ class CameraServer:
                 for part in parts:
                     client.sendall(part)
             except OSError:
-                self._hang_up()
+                self._drop_host()
 
     def _loop(self) -> None:
         while not self._stop.is_set():
-            if time.monotonic() < self._gone_until:
-                self._unlisten()
+            if self._gone:
+                self._shut()
                 self._stop.wait(0.01)
                 continue
             if self._listener is None:
-                self._listener = self._listen()
+                self._open()
+            assert self._listener is not None
             with contextlib.suppress(TimeoutError):
                 client, _ = self._listener.accept()
                 self._serve(client)

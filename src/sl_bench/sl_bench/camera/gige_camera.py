@@ -1,8 +1,7 @@
 """The bench's camera as a GigE Vision device: any GigE Vision host finds, sets and reads it.
 
 GigE Vision control protocol (GVCP 1.2) on UDP port 3956 of one address, frames by
-`sl_bench.camera.gige_stream`. It stands in for `sl_bench.camera.camera_server` and executes the
-same commands.
+`sl_bench.camera.gige_stream`. It stands in for `CameraServer` and executes the same commands.
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 from numpy.typing import NDArray
 
+from sl_bench.camera.endpoint import Endpoint, Execute
 from sl_bench.camera.gige_features import EXPOSURE_US, SOURCES, Reg, camera_xml
 from sl_bench.camera.gige_stream import CHUNK_SIZE, StreamFrame, StreamSender, wire_bytes
 from sl_camera.camera.pixel_formats import BY_CODE, WIRE_FORMATS
@@ -27,6 +26,7 @@ from sl_camera.drivers import socket_protocol as wire
 from sl_common.errors import SlError
 
 PORT = 3956
+SERIAL = "BENCH"
 KEY, ACK_WANTED = 0x42, 0x01
 DISCOVERY, RESEND, READ_REG, WRITE_REG, READ_MEM, WRITE_MEM = 0x02, 0x40, 0x80, 0x82, 0x84, 0x86
 NOT_IMPLEMENTED, INVALID_PARAMETER, INVALID_ADDRESS, ACCESS_DENIED = 0x8001, 0x8002, 0x8003, 0x8006
@@ -36,7 +36,6 @@ PACKET_SIZE = 8192
 HEARTBEAT_MS = 3000
 _POLL_S = 0.05
 
-Execute = Callable[[dict[str, Any]], dict[str, Any] | None]
 Host = tuple[str, int]
 
 
@@ -44,21 +43,21 @@ class _Refused(Exception):
     """A GVCP status other than success."""
 
 
-class GigeCamera:
+class GigeCamera(Endpoint):
     """A GigE Vision camera in front of a `CameraEmulator`.
+
+    After a disconnection everything is as after power-up.
 
     Parameters
     ----------
     execute : callable
-        ``execute(command) -> reply``, as in `sl_bench.camera.camera_server.CameraServer`.
+        See `Endpoint`.
     image_size : tuple of int
         (width, height) of the sensor, pixels.
     bits : int
         Significant bits of its pixels.
     address : str
         Network address; on one address of a machine there is one camera.
-    serial : str
-        Serial number.
     """
 
     def __init__(
@@ -67,52 +66,37 @@ class GigeCamera:
         image_size: tuple[int, int],
         bits: int = 8,
         address: str = "127.0.0.1",
-        serial: str = "BENCH",
     ) -> None:
-        self._execute = execute
+        super().__init__(execute, "gige control")
         self._size = image_size
         self._formats = {f.name: f.code for f in WIRE_FORMATS if f.bits == bits}
         self._formats = {n: c for n, c in self._formats.items() if not n.endswith("Packed")}
         self._address = address
-        self._identity = (serial, camera_xml(self._formats))
+        self._xml = camera_xml(self._formats)
         # A camera counts from when it was switched on, not from 1970.
         self._epoch_ns = time.time_ns() - 3_600_000_000_000
         self._controller: Host | None = None
         self._heard = 0.0
         self._acquiring = False
-        self._gone_until = 0.0
         self._lock = threading.Lock()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._loop, name="gige control", daemon=True)
-        self._reset()
+        self._drop_host()
 
-    def start(self) -> None:
-        """Answer hosts from here on; raises OSError when the port is taken."""
+    def _open(self) -> None:
         self._sockets = [self._bind(self._address)]
         with contextlib.suppress(OSError):  # discovery by broadcast; the address alone serves too
             self._sockets.append(self._bind("255.255.255.255"))
         self.stream = StreamSender(self._address)
-        self._thread.start()
 
-    def close(self) -> None:
-        """Be switched off."""
-        self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join()
-            for opened in self._sockets:
-                opened.close()
-            with self._lock:
-                self.stream.close()
-
-    def disconnect(self, seconds: float) -> None:
-        """Be gone for a while; afterwards everything is as after power-up."""
-        self._gone_until = time.monotonic() + seconds
-        self._reset()
+    def _shut(self) -> None:
+        for opened in self._sockets:
+            opened.close()
+        with self._lock:
+            self.stream.close()
 
     def send(self, header: wire.Header, pixels: NDArray[Any]) -> None:
-        """Send one frame to the host that is listening, if any."""
+        """See `Endpoint`."""
         port = self._word(Reg.STREAM_PORT) & 0xFFFF
-        if not (self._acquiring and port) or time.monotonic() < self._gone_until:
+        if not (self._acquiring and port) or self._gone:
             return
         format_ = BY_CODE[self._word(Reg.PIXEL_FORMAT)]
         packed = format_.bits if format_.packing == "lsb" else 0
@@ -133,36 +117,42 @@ class GigeCamera:
 
     # -- registers --------------------------------------------------------------------------
 
-    def _reset(self) -> None:
-        """Registers as after power-up."""
-        serial, xml = self._identity
-        memory = bytearray(Reg.XML + len(xml))
-        memory[Reg.XML :] = xml
-        texts = {
-            Reg.MANUFACTURER: "slrig", Reg.MODEL: "Bench", Reg.DEVICE_VERSION: "1",
-            Reg.MANUFACTURER_INFO: "simulated", Reg.SERIAL: serial,
-            Reg.XML_URL: f"Local:bench.xml;{Reg.XML:x};{len(xml):x}",
-        }  # fmt: skip
-        for address, text in texts.items():
-            memory[address : address + len(text)] = text.encode()
-        self._memory = memory
-        for address, value in self._power_up().items():
-            self._put(address, value)
-        self._memory[Reg.EXPOSURE : Reg.EXPOSURE + 8] = struct.pack(">d", 10_000.0)
-        self._memory[Reg.TICK_FREQUENCY : Reg.TICK_FREQUENCY + 8] = struct.pack(">Q", 10**9)
-        self._put(Reg.PAYLOAD, self._payload())
-        self._controller, self._acquiring = None, False
-
-    def _power_up(self) -> dict[Reg, int]:
+    def _drop_host(self) -> None:
+        """Registers as after power-up, and nobody in control."""
         width, height = self._size
-        return {
-            Reg.VERSION: 0x00010002, Reg.DEVICE_MODE: 0x80000001, Reg.N_INTERFACES: 1,
-            Reg.N_STREAMS: 1, Reg.CAPABILITY: 0x4000_0006, Reg.HEARTBEAT_MS: HEARTBEAT_MS,
+        self._memory = bytearray(Reg.XML) + self._xml
+        texts = {
+            Reg.MANUFACTURER: "slrig",
+            Reg.MODEL: "Bench",
+            Reg.DEVICE_VERSION: "1",
+            Reg.MANUFACTURER_INFO: "simulated",
+            Reg.SERIAL: SERIAL,
+            Reg.XML_URL: f"Local:bench.xml;{Reg.XML:x};{len(self._xml):x}",
+        }
+        for address, text in texts.items():
+            self._memory[address : address + len(text)] = text.encode()
+        words = {
+            Reg.VERSION: 0x00010002,
+            Reg.DEVICE_MODE: 0x80000001,
+            Reg.N_INTERFACES: 1,
+            Reg.N_STREAMS: 1,
+            Reg.CAPABILITY: 0x4000_0006,
+            Reg.HEARTBEAT_MS: HEARTBEAT_MS,
             Reg.IP_ADDRESS: int(ipaddress.IPv4Address(self._address)),
-            Reg.SUBNET_MASK: 0xFF000000, Reg.PACKET_SIZE: PACKET_SIZE,
-            Reg.WIDTH: width, Reg.HEIGHT: height, Reg.SENSOR_WIDTH: width,
-            Reg.SENSOR_HEIGHT: height, Reg.PIXEL_FORMAT: next(iter(self._formats.values())),
-        }  # fmt: skip
+            Reg.SUBNET_MASK: 0xFF000000,
+            Reg.PACKET_SIZE: PACKET_SIZE,
+            Reg.WIDTH: width,
+            Reg.HEIGHT: height,
+            Reg.SENSOR_WIDTH: width,
+            Reg.SENSOR_HEIGHT: height,
+            Reg.PIXEL_FORMAT: next(iter(self._formats.values())),
+        }
+        for address, value in words.items():
+            self._put(address, value)
+        struct.pack_into(">d", self._memory, Reg.EXPOSURE, 10_000.0)
+        struct.pack_into(">Q", self._memory, Reg.TICK_FREQUENCY, 10**9)
+        self._put(Reg.PAYLOAD, self._payload())
+        self._controller, self._heard, self._acquiring = None, 0.0, False
 
     def _word(self, address: int) -> int:
         return int.from_bytes(self._memory[address : address + 4], "big")
@@ -189,7 +179,7 @@ class GigeCamera:
             self._do({"op": "trigger"})
         elif address == Reg.TIMESTAMP_CONTROL and value & 2:
             ticks = time.time_ns() - self._epoch_ns
-            self._memory[Reg.TIMESTAMP : Reg.TIMESTAMP + 8] = struct.pack(">Q", ticks)
+            struct.pack_into(">Q", self._memory, Reg.TIMESTAMP, ticks)
         elif address == Reg.PACKET_SIZE and value & FIRE_TEST:
             self._fire_test(value & 0xFFFF)
         elif address == Reg.PIXEL_FORMAT and value not in self._formats.values():
@@ -254,7 +244,7 @@ class GigeCamera:
 
     def _receive(self, opened: socket.socket) -> None:
         data, host = opened.recvfrom(2048)
-        if time.monotonic() < self._gone_until or len(data) < 8 or data[0] != KEY:
+        if self._gone or len(data) < 8 or data[0] != KEY:
             return
         flags, command, size, request = struct.unpack_from(">BHHH", data, 1)
         status, answer = 0, b""
@@ -284,11 +274,10 @@ class GigeCamera:
             return self._take_writes(command, body, host)
         if command == RESEND:
             channel_block, first, last = struct.unpack_from(">III", body)
+            packets = range(first & 0xFFFFFF, (last & 0xFFFFFF) + 1)
+            to = self._host(self._word(Reg.STREAM_PORT) & 0xFFFF)
             with self._lock:
-                self.stream.send_again(
-                    channel_block & 0xFFFF, first & 0xFFFFFF, last & 0xFFFFFF,
-                    self._host(self._word(Reg.STREAM_PORT) & 0xFFFF),
-                )  # fmt: skip
+                self.stream.send_again(channel_block & 0xFFFF, packets, to)
             return b""
         raise _Refused(NOT_IMPLEMENTED)
 
@@ -323,7 +312,7 @@ class GigeCamera:
         self._written(address, value)
 
     def _check_heartbeat(self) -> None:
-        """Let go of a host that fell silent."""
+        """Drop a host that fell silent."""
         silent_s = time.monotonic() - self._heard
         if self._controller is not None and silent_s * 1e3 > self._word(Reg.HEARTBEAT_MS):
             self._controller, self._acquiring = None, False

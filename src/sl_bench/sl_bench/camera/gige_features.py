@@ -1,4 +1,4 @@
-"""The GenICam description of the bench's GigE Vision camera, made from one table of features.
+"""The GenICam description of the bench's GigE Vision camera.
 
 Names are SFNC 2.7's; registers below 0x8000 are GigE Vision's own (bootstrap registers), the
 others are this camera's choice.
@@ -6,7 +6,7 @@ others are this camera's choice.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from enum import IntEnum
 from xml.sax.saxutils import escape
 
@@ -73,6 +73,11 @@ _HEAD = """<?xml version="1.0" encoding="utf-8"?>
  VersionGuid="5d7e1d5e-0000-4000-8000-000000000002"
  xmlns="http://www.genicam.org/GenApi/Version_1_1">
 """
+_TAIL = '<Port Name="Device" NameSpace="Standard"/>\n</RegisterDescription>\n'
+
+
+#: Nodes by the names of their features.
+_Nodes = dict[str, str]
 
 
 def camera_xml(pixel_formats: Mapping[str, int]) -> bytes:
@@ -83,164 +88,128 @@ def camera_xml(pixel_formats: Mapping[str, int]) -> bytes:
     pixel_formats : mapping of str to int
         Names of the pixel formats that the sensor delivers, and their PFNC codes.
     """
-    parts = [
-        _HEAD, _categories(), _device(), _image(pixel_formats), _acquisition(), _chunks(),
-        _transport(), '<Port Name="Device" NameSpace="Standard"/>\n</RegisterDescription>\n',
-    ]  # fmt: skip
-    return "".join(parts).encode()
-
-
-def _categories() -> str:
     groups = {
-        "DeviceControl": ("DeviceVendorName", "DeviceModelName", "DeviceID"),
-        "ImageFormatControl": (
-            "SensorWidth", "SensorHeight", "OffsetX", "OffsetY", "Width", "Height", "PixelFormat",
-        ),
-        "AcquisitionControl": (
-            "AcquisitionMode", "AcquisitionStart", "AcquisitionStop", "TriggerSelector",
-            "TriggerMode", "TriggerSource", "TriggerActivation", "TriggerSoftware", "ExposureTime",
-        ),
-        "AnalogControl": ("Gain",),
-        "ChunkDataControl": (
-            "ChunkModeActive", "ChunkSelector", "ChunkEnable", "ChunkFrameID", "ChunkTimestamp",
-            "ChunkExposureTime",
-        ),
-        "TransportLayerControl": (
-            "PayloadSize", "GevTimestampTickFrequency", "GevTimestampControlLatch",
-            "GevTimestampValue",
-        ),
-    }  # fmt: skip
-    text = _category("Root", tuple(groups))
-    return text + "".join(_category(name, features) for name, features in groups.items())
+        "DeviceControl": _device(),
+        "ImageFormatControl": _image(pixel_formats),
+        "AcquisitionControl": _acquisition(),
+        "AnalogControl": _float("Gain", Reg.GAIN, GAIN_DB, "dB"),
+        "ChunkDataControl": _chunks(),
+        "TransportLayerControl": _transport(),
+    }
+    text = _HEAD + _element("Category", "Root", pFeature=list(groups))
+    for name, features in groups.items():
+        text += _element("Category", name, pFeature=list(features)) + "".join(features.values())
+    for name, number in CHUNK_IDS.items():
+        text += f'<Port Name="Chunk{name}Port"><ChunkID>{number:x}</ChunkID></Port>\n'
+    return (text + _TAIL).encode()
 
 
-def _category(name: str, features: Sequence[str]) -> str:
-    inner = "".join(f"<pFeature>{feature}</pFeature>" for feature in features)
-    return f'<Category Name="{name}" NameSpace="Standard">{inner}</Category>\n'
-
-
-def _device() -> str:
-    return "".join(
-        f'<StringReg Name="{name}" NameSpace="Standard"><Address>{address:#x}</Address>'
-        f"<Length>{length}</Length><AccessMode>RO</AccessMode><pPort>Device</pPort></StringReg>\n"
-        for name, address, length in (
-            ("DeviceVendorName", Reg.MANUFACTURER, 32),
-            ("DeviceModelName", Reg.MODEL, 32),
-            ("DeviceVersion", Reg.DEVICE_VERSION, 32),
-            ("DeviceManufacturerInfo", Reg.MANUFACTURER_INFO, 48),
-            ("DeviceID", Reg.SERIAL, 16),
-        )
-    )
-
-
-def _image(pixel_formats: Mapping[str, int]) -> str:
+def _device() -> _Nodes:
     return (
-        _int_reg("SensorWidth", Reg.SENSOR_WIDTH, "RO")
-        + _int_reg("SensorHeight", Reg.SENSOR_HEIGHT, "RO")
-        + _integer("OffsetX", Reg.OFFSET_X, 0, "SensorWidth")
-        + _integer("OffsetY", Reg.OFFSET_Y, 0, "SensorHeight")
-        + _integer("Width", Reg.WIDTH, 1, "SensorWidth")
-        + _integer("Height", Reg.HEIGHT, 1, "SensorHeight")
-        + _enumeration("PixelFormat", Reg.PIXEL_FORMAT, pixel_formats)
+        _register("StringReg", "DeviceVendorName", Reg.MANUFACTURER, 32)
+        | _register("StringReg", "DeviceModelName", Reg.MODEL, 32)
+        | _register("StringReg", "DeviceVersion", Reg.DEVICE_VERSION, 32)
+        | _register("StringReg", "DeviceManufacturerInfo", Reg.MANUFACTURER_INFO, 48)
+        | _register("StringReg", "DeviceID", Reg.SERIAL, 16)
     )
 
 
-def _acquisition() -> str:
+def _image(pixel_formats: Mapping[str, int]) -> _Nodes:
+    return (
+        _register("IntReg", "SensorWidth", Reg.SENSOR_WIDTH)
+        | _register("IntReg", "SensorHeight", Reg.SENSOR_HEIGHT)
+        | _feature("Integer", "OffsetX", Reg.OFFSET_X, Min=0, pMax="SensorWidth", Inc=1)
+        | _feature("Integer", "OffsetY", Reg.OFFSET_Y, Min=0, pMax="SensorHeight", Inc=1)
+        | _feature("Integer", "Width", Reg.WIDTH, Min=1, pMax="SensorWidth", Inc=1)
+        | _feature("Integer", "Height", Reg.HEIGHT, Min=1, pMax="SensorHeight", Inc=1)
+        | _enumeration("PixelFormat", Reg.PIXEL_FORMAT, pixel_formats)
+    )
+
+
+def _acquisition() -> _Nodes:
     return (
         _enumeration("AcquisitionMode", Reg.ACQUISITION_MODE, {"Continuous": 0})
-        + _command("AcquisitionStart", Reg.ACQUISITION_START, 1)
-        + _command("AcquisitionStop", Reg.ACQUISITION_STOP, 1)
-        + _enumeration("TriggerSelector", Reg.TRIGGER_SELECTOR, {"FrameStart": 0})
-        + _enumeration("TriggerMode", Reg.TRIGGER_MODE, {"Off": 0, "On": 1})
-        + _enumeration("TriggerSource", Reg.TRIGGER_SOURCE, SOURCES)
-        + _enumeration("TriggerActivation", Reg.TRIGGER_ACTIVATION, {"RisingEdge": 0})
-        + _command("TriggerSoftware", Reg.TRIGGER_SOFTWARE, 1)
-        + _float("ExposureTime", Reg.EXPOSURE, EXPOSURE_US, "us")
-        + _float("Gain", Reg.GAIN, GAIN_DB, "dB")
+        | _command("AcquisitionStart", Reg.ACQUISITION_START, 1)
+        | _command("AcquisitionStop", Reg.ACQUISITION_STOP, 1)
+        | _enumeration("TriggerSelector", Reg.TRIGGER_SELECTOR, {"FrameStart": 0})
+        | _enumeration("TriggerMode", Reg.TRIGGER_MODE, {"Off": 0, "On": 1})
+        | _enumeration("TriggerSource", Reg.TRIGGER_SOURCE, SOURCES)
+        | _enumeration("TriggerActivation", Reg.TRIGGER_ACTIVATION, {"RisingEdge": 0})
+        | _command("TriggerSoftware", Reg.TRIGGER_SOFTWARE, 1)
+        | _float("ExposureTime", Reg.EXPOSURE, EXPOSURE_US, "us")
     )
 
 
-def _chunks() -> str:
+def _chunks() -> _Nodes:
     """All chunks share one enabling register: whichever is selected, all come."""
-    text = (
-        _boolean("ChunkModeActive", Reg.CHUNK_MODE)
-        + _enumeration(
-            "ChunkSelector", Reg.CHUNK_SELECTOR, {name: i for i, name in enumerate(CHUNK_IDS)}
-        )
-        + _boolean("ChunkEnable", Reg.CHUNK_ENABLE)
+    nodes = (
+        _feature("Boolean", "ChunkModeActive", Reg.CHUNK_MODE, OnValue=1, OffValue=0)
+        | _enumeration("ChunkSelector", Reg.CHUNK_SELECTOR, {n: i for i, n in enumerate(CHUNK_IDS)})
+        | _feature("Boolean", "ChunkEnable", Reg.CHUNK_ENABLE, OnValue=1, OffValue=0)
     )
-    for name, number in CHUNK_IDS.items():
-        port = f"Chunk{name}Port"
-        text += f'<Port Name="{port}"><ChunkID>{number:x}</ChunkID></Port>\n'
-        if name == "ExposureTime":
-            text += _float_reg(f"Chunk{name}", 0, port, "RO")
-        else:
-            text += _int_reg(f"Chunk{name}", 0, "RO", 8, port)
-    return text
+    for name in CHUNK_IDS:
+        kind = "FloatReg" if name == "ExposureTime" else "IntReg"
+        nodes |= _register(kind, f"Chunk{name}", 0, 8, port=f"Chunk{name}Port")
+    return nodes
 
 
-def _transport() -> str:
+def _transport() -> _Nodes:
     return (
-        _int_reg("PayloadSize", Reg.PAYLOAD, "RO")
-        + _int_reg("GevTimestampTickFrequency", Reg.TICK_FREQUENCY, "RO", 8)
-        + _command("GevTimestampControlLatch", Reg.TIMESTAMP_CONTROL, 2)
-        + _int_reg("GevTimestampValue", Reg.TIMESTAMP, "RO", 8)
+        _register("IntReg", "PayloadSize", Reg.PAYLOAD)
+        | _register("IntReg", "GevTimestampTickFrequency", Reg.TICK_FREQUENCY, 8)
+        | _command("GevTimestampControlLatch", Reg.TIMESTAMP_CONTROL, 2)
+        | _register("IntReg", "GevTimestampValue", Reg.TIMESTAMP, 8)
     )
 
 
 # -- nodes ----------------------------------------------------------------------------------------
 
 
-def _int_reg(name: str, address: int, access: str, length: int = 4, port: str = "Device") -> str:
-    return (
-        f'<IntReg Name="{name}"><Address>{address:#x}</Address><Length>{length}</Length>'
-        f"<AccessMode>{access}</AccessMode><pPort>{port}</pPort><Cachable>NoCache</Cachable>"
-        "<Sign>Unsigned</Sign><Endianess>BigEndian</Endianess></IntReg>\n"
-    )
+def _element(tag: str, name: str, before: str = "", /, **fields: object) -> str:
+    """XML of a node with its fields in order; a list is a field that repeats."""
+    inner = before
+    for key, value in fields.items():
+        for item in value if isinstance(value, list) else [value]:
+            inner += f"<{key}>{item}</{key}>"
+    return f'<{tag} Name="{name}" NameSpace="Standard">{inner}</{tag}>\n'
 
 
-def _float_reg(name: str, address: int, port: str, access: str) -> str:
-    return (
-        f'<FloatReg Name="{name}"><Address>{address:#x}</Address><Length>8</Length>'
-        f"<AccessMode>{access}</AccessMode><pPort>{port}</pPort><Cachable>NoCache</Cachable>"
-        "<Endianess>BigEndian</Endianess></FloatReg>\n"
-    )
+def _register(
+    tag: str, name: str, address: int, length: int = 4, access: str = "RO", port: str = "Device"
+) -> _Nodes:
+    """A place in the camera's memory."""
+    fields: dict[str, object] = {"Address": f"{address:#x}", "Length": length}
+    fields |= {"AccessMode": access, "pPort": port}
+    if tag != "StringReg":
+        sign = {"Sign": "Unsigned"} if tag == "IntReg" else {}
+        fields |= {"Cachable": "NoCache", **sign, "Endianess": "BigEndian"}
+    return {name: _element(tag, name, "", **fields)}
 
 
-def _integer(name: str, address: int, low: int, high: str) -> str:
-    return (
-        f'<Integer Name="{name}" NameSpace="Standard"><pValue>{name}Reg</pValue><Min>{low}</Min>'
-        f"<pMax>{high}</pMax><Inc>1</Inc></Integer>\n"
-    ) + _int_reg(f"{name}Reg", address, "RW")
+def _feature(
+    tag: str,
+    name: str,
+    address: int,
+    before: str = "",
+    *,
+    register: tuple[str, int] = ("IntReg", 4),
+    access: str = "RW",
+    **fields: object,
+) -> _Nodes:
+    """A feature with the register that holds its value."""
+    (stored,) = _register(register[0], f"{name}Reg", address, register[1], access).values()
+    return {name: _element(tag, name, before, pValue=f"{name}Reg", **fields) + stored}
 
 
-def _boolean(name: str, address: int) -> str:
-    return (
-        f'<Boolean Name="{name}" NameSpace="Standard"><pValue>{name}Reg</pValue>'
-        "<OnValue>1</OnValue><OffValue>0</OffValue></Boolean>\n"
-    ) + _int_reg(f"{name}Reg", address, "RW")
+def _enumeration(name: str, address: int, entries: Mapping[str, int]) -> _Nodes:
+    inner = "".join(_element("EnumEntry", escape(e), Value=v) for e, v in entries.items())
+    return _feature("Enumeration", name, address, inner)
 
 
-def _enumeration(name: str, address: int, entries: Mapping[str, int]) -> str:
-    inner = "".join(
-        f'<EnumEntry Name="{escape(entry)}" NameSpace="Standard"><Value>{value}</Value></EnumEntry>'
-        for entry, value in entries.items()
-    )
-    return (
-        f'<Enumeration Name="{name}" NameSpace="Standard">{inner}<pValue>{name}Reg</pValue>'
-        "</Enumeration>\n"
-    ) + _int_reg(f"{name}Reg", address, "RW")
+def _command(name: str, address: int, value: int) -> _Nodes:
+    return _feature("Command", name, address, access="WO", CommandValue=value)
 
 
-def _command(name: str, address: int, value: int) -> str:
-    return (
-        f'<Command Name="{name}" NameSpace="Standard"><pValue>{name}Reg</pValue>'
-        f"<CommandValue>{value}</CommandValue></Command>\n"
-    ) + _int_reg(f"{name}Reg", address, "WO")
-
-
-def _float(name: str, address: int, bounds: tuple[float, float], unit: str) -> str:
-    return (
-        f'<Float Name="{name}" NameSpace="Standard"><pValue>{name}Reg</pValue>'
-        f"<Min>{bounds[0]}</Min><Max>{bounds[1]}</Max><Unit>{unit}</Unit></Float>\n"
-    ) + _float_reg(f"{name}Reg", address, "Device", "RW")
+def _float(name: str, address: int, bounds: tuple[float, float], unit: str) -> _Nodes:
+    low, high = bounds
+    return _feature("Float", name, address, register=("FloatReg", 8), Min=low, Max=high, Unit=unit)

@@ -70,7 +70,7 @@ class StreamFrame:
         return (self.number - 1) % LAST_BLOCK + 1
 
 
-def chunk_bytes(frame: StreamFrame) -> bytes:
+def _chunk_bytes(frame: StreamFrame) -> bytes:
     """Chunks behind the pixels: data, id, length, the first one's data being the pixels."""
     values = {
         "FrameID": struct.pack(">Q", frame.number),
@@ -83,31 +83,23 @@ def chunk_bytes(frame: StreamFrame) -> bytes:
     return text
 
 
-#: Bytes that `chunk_bytes` adds.
+#: Bytes that the chunks add to a frame.
 CHUNK_SIZE = 8 + len(CHUNK_IDS) * 16
 
 
-class Packets:
-    """The packets of one frame.
-
-    Parameters
-    ----------
-    frame : StreamFrame
-        What they carry.
-    packet_size : int
-        Bytes of a packet with all its headers.
-    """
+class _Packets:
+    """The packets of one frame; ``packet_size`` is in bytes with all headers."""
 
     def __init__(self, frame: StreamFrame, packet_size: int) -> None:
         self._frame = frame
         self._step = max(packet_size, OVERHEAD + 64) - OVERHEAD
-        data = frame.data + chunk_bytes(frame) if frame.chunks else frame.data
+        data = frame.data + _chunk_bytes(frame) if frame.chunks else frame.data
         self._data = memoryview(data)
         self.count = 2 + -(-len(data) // self._step)
         self.sendable = self.count if frame.complete else self.count // 2
 
     def packet(self, number: int) -> list[bytes | memoryview]:
-        """Parts of one packet; of one that is not kept the word that says so."""
+        """Parts of one packet; of one that is not kept, the status that says so."""
         if number >= self.sendable and number < self.count and not self._frame.complete:
             return [struct.pack(">HHI", UNAVAILABLE, self._frame.block, PAYLOAD << 24 | number)]
         if number == 0:
@@ -140,13 +132,20 @@ class StreamSender:
     ----------
     address : str
         Own network address.
+
+    Attributes
+    ----------
+    lose : float
+        Fault: share of the packets that get lost, 0 to 1.
+    resend : bool
+        Whether packets that the host misses are sent again.
     """
 
     def __init__(self, address: str) -> None:
         self.lose = 0.0
         self.resend = True
         self._random = random.Random(0)
-        self._kept: OrderedDict[int, Packets] = OrderedDict()
+        self._kept: OrderedDict[int, _Packets] = OrderedDict()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 22)
         self._socket.bind((address, 0))
@@ -156,8 +155,18 @@ class StreamSender:
         self._socket.close()
 
     def send(self, frame: StreamFrame, packet_size: int, to: tuple[str, int]) -> None:
-        """Send all packets of a frame, less those that get lost on request."""
-        packets = Packets(frame, packet_size)
+        """Send all packets of a frame, less those that get lost on request.
+
+        Parameters
+        ----------
+        frame : StreamFrame
+            The frame.
+        packet_size : int
+            Bytes of a packet with all its headers.
+        to : tuple
+            Address and port of the host.
+        """
+        packets = _Packets(frame, packet_size)
         self._kept[frame.block] = packets
         while len(self._kept) > KEPT:
             self._kept.popitem(last=False)
@@ -165,17 +174,35 @@ class StreamSender:
             if not (self.lose and self._random.random() < self.lose):
                 self._socket.sendmsg(packets.packet(number), [], 0, to)
 
-    def send_again(self, block: int, first: int, last: int, to: tuple[str, int]) -> None:
-        """Send packets again that the host missed."""
+    def send_again(self, block: int, numbers: range, to: tuple[str, int]) -> None:
+        """Send packets again that the host missed.
+
+        Parameters
+        ----------
+        block : int
+            Block id of their frame.
+        numbers : range
+            The packets.
+        to : tuple
+            Address and port of the host.
+        """
         packets = self._kept.get(block)
         if packets is None or not self.resend:
             return
-        for number in range(first, min(last, packets.count - 1) + 1):
+        for number in numbers[: max(packets.count - numbers.start, 0)]:
             self._socket.sendmsg(packets.packet(number), [], 0, to)
 
 
 def wire_bytes(pixels: NDArray[Any], packed_bits: int) -> bytes:
-    """Pixels as they go over the wire, packed to 10 or 12 bits (PFNC "p") where that is not 0."""
+    """Pixels as they go over the wire.
+
+    Parameters
+    ----------
+    pixels : ndarray, (H, W) uint8 or uint16
+        The image.
+    packed_bits : {0, 10, 12}
+        Bits per pixel of a packed format (PFNC "p"); 0 for whole bytes.
+    """
     if packed_bits == 0:
         return np.ascontiguousarray(pixels).tobytes()
     flat = pixels.reshape(-1).astype("<u2")

@@ -17,14 +17,14 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_bench.camera.camera_emulator import CameraEmulator, Endpoint, Execute, Exposure, Position
+from sl_bench.camera.camera_emulator import CameraEmulator, Exposure, Position
 from sl_bench.camera.camera_faults import CameraFaults
+from sl_bench.camera.endpoint import Endpoint, Execute
 from sl_bench.camera.gige_camera import GigeCamera
 from sl_bench.dlpc.dlpc900_emulator import Dlpc900Emulator
 from sl_bench.dlpc.dlpc_faults import DlpcFaults
@@ -38,12 +38,14 @@ from sl_bench.world.world import World
 from sl_common.errors import ConfigError, SlError
 
 #: Faults of the stage that the control socket may ask for: methods of `GrblEmulator`.
-STAGE_FAULTS = (
-    "noise", "lose_replies", "delay_replies", "fall_silent", "alarm", "close_switch",
-    "open_switches", "remove_switches", "jam", "lose_steps", "power_cycle",
-)  # fmt: skip
+STAGE_FAULTS = frozenset(
+    {"noise", "lose_replies", "delay_replies", "fall_silent", "alarm", "close_switch"}
+    | {"open_switches", "remove_switches", "jam", "lose_steps", "power_cycle"}
+)
+#: Faults of the DMD that are fields.
+DMD_FAULTS = frozenset(f.name for f in fields(DlpcFaults) if not f.name.startswith("_"))
 
-#: The stage rests when it is found twice in the same place, so much apart.
+#: The stage rests when it is found in the same place twice, this time apart.
 REST_S = 0.02
 
 
@@ -75,8 +77,10 @@ class Bench:
             homed=settings.stage_homed,
             seed=settings.seed,
         )
+        self.gige: GigeCamera | None = None
+        self._gige_address = settings.camera_gige
         self.camera = CameraEmulator(
-            self._camera_endpoint(settings),
+            self._serve_gige if settings.camera_gige else self._dir / "camera.sock",
             self._render,
             rig.camera.image_size,
             stage_m=self.stage.position_at,
@@ -118,60 +122,50 @@ class Bench:
         self.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _camera_endpoint(self, settings: BenchSettings) -> Path | Callable[[Execute], Endpoint]:
-        """Where the camera is served: a socket, or GigE Vision."""
-        self.gige: GigeCamera | None = None
-        if not settings.camera_gige:
-            return self._dir / "camera.sock"
-
-        def make(execute: Execute) -> Endpoint:
-            size, bits = self.world.rig.camera.image_size, self.world.optics.bits
-            self.gige = GigeCamera(execute, size, bits, settings.camera_gige)
-            return self.gige
-
-        return make
+    def _serve_gige(self, execute: Execute) -> Endpoint:
+        size, bits = self.world.rig.camera.image_size, self.world.optics.bits
+        self.gige = GigeCamera(execute, size, bits, self._gige_address)
+        return self.gige
 
     def _render(self, exposure: Exposure) -> NDArray[Any]:
         # The lamp scales time, not mirrors, so that the world's cache of noise-free frames holds.
         shown = [(mirrors, seconds * self._lamp) for mirrors, seconds in exposure.shown]
         with self._world_lock:
-            self.world.move(*self._mounting.pose(exposure.stage_m))
+            self._move_part(exposure.stage_m)
             return self.world.expose(shown, exposure.exposure_s, exposure.number)
 
     def _prepare_loop(self) -> None:
         """Trace the rays as soon as the stage rests in a new place, or with a new part.
 
-        The first frame of a scan right after that would wait for it, half a second or so.
+        The first frame of a scan right after that would else wait for it, half a second or so.
         """
         before = ready = (self._parts, self.stage.position_m())
         while not self._ended.wait(REST_S):
             now = (self._parts, self.stage.position_m())
             if now == before != ready:
-                self._prepare(now[1])
+                with self._world_lock:
+                    self._move_part(now[1])
+                    self.world.ambient_e_per_s()
                 ready = now
             before = now
 
-    def _prepare(self, stage_m: Position) -> None:
-        with self._world_lock:
-            self.world.move(*self._mounting.pose(stage_m))
-            self.world.ambient_e_per_s()
+    def _move_part(self, stage_m: Position) -> None:
+        self.world.move(*self._mounting.pose(stage_m))
 
     # -- control ----------------------------------------------------------------------------
 
     def execute(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Do what one request of the control socket asks; see `sl_bench.process.bench_control`."""
         actions: dict[str, Callable[[Any], dict[str, Any]]] = {
-            "put": self._put, "lamp": self._set_lamp, "fault": self._fault, "truth": self._truth,
+            "put": self._put,
+            "lamp": self._set_lamp,
+            "fault": self._fault,
+            "truth": self._truth,
             "state": self._state,
-        }  # fmt: skip
+        }
         if len(request) != 1 or next(iter(request)) not in actions:
             raise ConfigError(f"request {list(request)}; expected one of {list(actions)}")
         ((name, argument),) = request.items()
@@ -200,7 +194,7 @@ class Bench:
             raise ConfigError(f"truth {what!r}; expected 'rig' or {{'points': [[u, v], ...]}}")
         pixels = np.array(what["points"], dtype=np.float64).reshape(-1, 2)
         with self._world_lock:
-            self.world.move(*self._mounting.pose(self.stage.position_m()))
+            self._move_part(self.stage.position_m())
             points, lit = self.world.truth_points(pixels), self.world.truth_lit(pixels)
         return {
             "points_m": [p.tolist() if np.isfinite(p).all() else None for p in points],
@@ -223,8 +217,10 @@ class Bench:
 
     def _fault(self, request: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         devices = {
-            "camera": self._fault_camera, "projector": self._fault_dmd, "stage": self._fault_stage,
-        }  # fmt: skip
+            "camera": self._fault_camera,
+            "projector": self._fault_dmd,
+            "stage": self._fault_stage,
+        }
         unknown = set(request) - set(devices)
         if unknown:
             raise ConfigError(f"no device is called {sorted(unknown)}; expected {list(devices)}")
@@ -237,7 +233,7 @@ class Bench:
     def _clear_faults(self) -> None:
         self.camera.faults = CameraFaults()
         self._fault_packets(0.0, True)
-        self._fault_dmd({f.name: getattr(DlpcFaults(), f.name) for f in _dmd_faults()})
+        self._fault_dmd({name: getattr(DlpcFaults(), name) for name in DMD_FAULTS})
         self.stage.open_switches()
         self.stage.jam(False)
         self.stage.fall_silent(False)
@@ -263,9 +259,7 @@ class Bench:
 
     def _fault_dmd(self, faults: dict[str, Any]) -> None:
         seconds, cycle = faults.pop("unplug_s", None), faults.pop("power_cycle", False)
-        known = {f.name for f in _dmd_faults()}
-        if set(faults) - known:
-            raise ConfigError(f"projector faults {sorted(faults)}; expected of {sorted(known)}")
+        _check_faults("projector", faults, DMD_FAULTS)
         for name, value in faults.items():
             setattr(self.dmd.faults, name, set(value) if name.endswith("_edges") else value)
         if cycle:
@@ -276,8 +270,7 @@ class Bench:
 
     def _fault_stage(self, faults: dict[str, Any]) -> None:
         seconds = faults.pop("unplug_s", None)
-        if set(faults) - set(STAGE_FAULTS):
-            raise ConfigError(f"stage faults {sorted(faults)}; expected of {STAGE_FAULTS}")
+        _check_faults("stage", faults, STAGE_FAULTS)
         for name, argument in faults.items():
             arguments = argument if isinstance(argument, list) else [argument]
             getattr(self.stage, name)(*([] if argument is None else arguments))
@@ -292,8 +285,9 @@ class Bench:
         timer.start()
 
 
-def _dmd_faults() -> list[Any]:
-    return [f for f in fields(DlpcFaults) if not f.name.startswith("_")]
+def _check_faults(device: str, faults: Mapping[str, Any], known: frozenset[str]) -> None:
+    if set(faults) - known:
+        raise ConfigError(f"{device} faults {sorted(faults)}; expected of {sorted(known)}")
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:

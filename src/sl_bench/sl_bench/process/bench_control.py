@@ -28,10 +28,10 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
+import socketserver
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from sl_common.errors import DeviceLost, DeviceRefused, SlError
@@ -40,7 +40,27 @@ _POLL_S = 0.1
 MAX_LINE = 1 << 20
 
 
-class ControlServer:
+class _Connection(socketserver.StreamRequestHandler):
+    """One client: line by line, until it is gone."""
+
+    server: ControlServer
+
+    def handle(self) -> None:
+        with contextlib.suppress(OSError):
+            while line := self.rfile.readline(MAX_LINE):
+                self.wfile.write(json.dumps(self._answer(line)).encode() + b"\n")
+
+    def _answer(self, line: bytes) -> dict[str, Any]:
+        try:
+            request = json.loads(line)
+            if not isinstance(request, dict):
+                return {"ok": False, "error": f"{line[:80]!r} is no JSON object"}
+            return {"ok": True, **self.server.execute(request)}
+        except (SlError, ValueError, TypeError) as error:
+            return {"ok": False, "error": str(error)}
+
+
+class ControlServer(socketserver.ThreadingUnixStreamServer):
     """Serves the control socket, a thread per connection.
 
     Parameters
@@ -48,55 +68,30 @@ class ControlServer:
     path : path
         The socket; removed at `close`.
     execute : callable
-        ``execute(request) -> reply``; a `SlError` becomes the reply.
+        ``execute(request) -> reply``; an `SlError` becomes the reply.
     """
+
+    daemon_threads = True
 
     def __init__(
         self, path: str | Path, execute: Callable[[dict[str, Any]], dict[str, Any]]
     ) -> None:
+        self.execute = execute
         self._path = Path(path)
-        self._execute = execute
-        self._stop = threading.Event()
         self._path.unlink(missing_ok=True)
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._listener.bind(str(self._path))
-        self._listener.listen()
-        self._listener.settimeout(_POLL_S)
-        self._thread = threading.Thread(target=self._accept, name="bench control", daemon=True)
+        super().__init__(str(path), _Connection)
 
     def start(self) -> None:
         """Accept connections from here on."""
-        self._thread.start()
+        threading.Thread(
+            target=self.serve_forever, args=(_POLL_S,), name="bench control", daemon=True
+        ).start()
 
     def close(self) -> None:
-        """Stop serving and remove the socket."""
-        self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join()
-        self._listener.close()
+        """Stop serving, after `start`, and remove the socket."""
+        self.shutdown()
+        self.server_close()
         self._path.unlink(missing_ok=True)
-
-    def _accept(self) -> None:
-        while not self._stop.is_set():
-            with contextlib.suppress(TimeoutError):
-                connection, _ = self._listener.accept()
-                threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
-
-    def _serve(self, connection: socket.socket) -> None:
-        connection.settimeout(None)
-        with contextlib.suppress(OSError), connection, connection.makefile("rwb") as stream:
-            while line := stream.readline(MAX_LINE):
-                stream.write(json.dumps(self._answer(line)).encode() + b"\n")
-                stream.flush()
-
-    def _answer(self, line: bytes) -> dict[str, Any]:
-        try:
-            request = json.loads(line)
-            if not isinstance(request, dict):
-                return {"ok": False, "error": f"{line[:80]!r} is no JSON object"}
-            return {"ok": True, **self._execute(request)}
-        except (SlError, ValueError, TypeError) as error:
-            return {"ok": False, "error": str(error)}
 
 
 class BenchControl:
@@ -107,7 +102,7 @@ class BenchControl:
     path : path
         ``control.sock`` in the bench's runtime directory, or the directory.
     timeout_s : float
-        A reply may take so long.
+        Longest wait for a reply, seconds.
 
     Raises
     ------
@@ -151,7 +146,15 @@ class BenchControl:
         return reply
 
     def put(self, surface: str, finish: str | None = None, **parameters: object) -> None:
-        """Exchange the part."""
+        """Exchange the part.
+
+        Parameters
+        ----------
+        surface, finish : str
+            Names, see `make_surface` and `make_finish`; the finish stays unless given.
+        **parameters
+            Of the surface.
+        """
         request = {"surface": surface, "parameters": parameters}
         self.ask({"put": request if finish is None else {**request, "finish": finish}})
 
@@ -160,7 +163,15 @@ class BenchControl:
         self.ask({"lamp": brightness})
 
     def fault(self, device: str, **faults: object) -> None:
-        """Make a device fail: "camera", "projector" or "stage"."""
+        """Make a device fail.
+
+        Parameters
+        ----------
+        device : {"camera", "projector", "stage"}
+            The device.
+        **faults
+            See the module's table.
+        """
         self.ask({"fault": {device: faults}})
 
     def clear_faults(self) -> None:
@@ -188,10 +199,5 @@ class BenchControl:
     def __enter__(self) -> BenchControl:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

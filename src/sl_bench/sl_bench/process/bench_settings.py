@@ -8,11 +8,19 @@ from pathlib import Path
 from typing import Any
 
 from sl_bench.world.mounting import Mounting, Triple
-from sl_bench.world.optics import Finish, Optics, make_finish
+from sl_bench.world.optics import Finish, Optics, check_ranges, make_finish
 from sl_bench.world.reference_rig import reference_rig
 from sl_bench.world.surfaces import Surface, make_surface
 from sl_bench.world.true_rig import read_rig
-from sl_common.documents import read_document
+from sl_common.documents import (
+    Fields,
+    a_flag,
+    a_number,
+    a_whole_number,
+    describe,
+    numbers,
+    read_document,
+)
 from sl_common.errors import ConfigError
 from sl_projector.dlpc.dmd import DEFAULT_MODEL, DmdModel, dmd_model
 from sl_reconstruct.model.rig import Rig
@@ -73,15 +81,10 @@ class BenchSettings:
     niceness: int = 5
 
     def __post_init__(self) -> None:
-        for option in fields(self):
-            value = getattr(self, option.name)
-            object.__setattr__(self, option.name, _checked(option.name, value))
-        if not 0.01 <= self.camera_frame_rate_hz <= 10_000:
-            raise ConfigError(
-                f"camera_frame_rate_hz={self.camera_frame_rate_hz}; expected 0.01 to 10000"
-            )
-        if not 0 <= self.camera_readout_s <= 10:
-            raise ConfigError(f"camera_readout_s={self.camera_readout_s}; expected 0 to 10")
+        for name, default in _DEFAULTS.items():
+            value = _read_like(default, getattr(self, name), f"{SECTION}: {name}")
+            object.__setattr__(self, name, value)
+        check_ranges(self, SECTION, camera_frame_rate_hz=(0.01, 1e4), camera_readout_s=(0.0, 10.0))
         if not all(0.001 <= travel <= 1 for travel in self.stage_travel_m):
             raise ConfigError(f"stage_travel_m={self.stage_travel_m}; expected 0.001 to 1 each")
 
@@ -133,31 +136,24 @@ _DEFAULTS: dict[str, Any] = {
 }
 
 
-def _checked(name: str, value: Any) -> Any:
-    """Value of a setting in the type of its default."""
-    default = _DEFAULTS[name]
-    if isinstance(default, bool) or isinstance(value, bool):
-        good = isinstance(default, bool) and isinstance(value, bool)
-    elif isinstance(default, float):
-        good, value = (
-            isinstance(value, int | float),
-            float(value) if isinstance(value, int) else value,
-        )
-    elif isinstance(default, tuple):
-        good = isinstance(value, list | tuple) and len(value) == len(default)
-        good = good and all(isinstance(v, int | float) for v in value)
-        value = tuple(map(float, value)) if good else value
-    elif isinstance(default, int | str):
-        good = isinstance(value, type(default))
-    else:
-        good = isinstance(value, Mapping)
-    if not good:
-        raise ConfigError(f"{SECTION}: {name}={value!r}; expected such as {default!r}")
+def _read_like(default: Any, value: Any, where: str) -> Any:
+    """Value of a setting, checked to be of the default's type."""
+    if isinstance(default, tuple):
+        items = list(value) if isinstance(value, tuple) else value
+        return tuple(numbers(len(default))(items, where, ConfigError))
+    if isinstance(default, bool):
+        return a_flag(value, where, ConfigError)
+    if isinstance(default, int):
+        return a_whole_number(value, where, ConfigError)
+    if isinstance(default, float):
+        return a_number(value, where, ConfigError)
+    if not isinstance(value, str if isinstance(default, str) else Mapping):
+        raise ConfigError(f"{where} is {describe(value)}; expected such as {default!r}")
     return value
 
 
 def read_settings(path: str | Path) -> BenchSettings:
-    """Read the bench's section of a ROS parameter file; the rest of the file is others'.
+    """Read the bench's section of a ROS parameter file; the rest of the file is not looked at.
 
     Raises
     ------
@@ -168,13 +164,8 @@ def read_settings(path: str | Path) -> BenchSettings:
     document = read_document(path, ConfigError)
     section = document.get(SECTION, {}) if isinstance(document, dict) else None
     parameters = section.get("ros__parameters", {}) if isinstance(section, dict) else None
-    if not isinstance(parameters, dict):
-        raise ConfigError(f"{path}: expected a mapping {SECTION}: ros__parameters:")
-    unknown = set(parameters) - set(_DEFAULTS)
-    if unknown:
-        raise ConfigError(
-            f"{path}: {SECTION} has no setting {sorted(unknown)}; expected of {sorted(_DEFAULTS)}"
-        )
+    Fields(parameters, f"{path}: {SECTION}: ros__parameters", ConfigError, list(_DEFAULTS))
+    assert isinstance(parameters, dict)
     settings = BenchSettings(**parameters)
     if settings.rig != "reference":
         settings = replace(settings, rig=str(path.parent / settings.rig))

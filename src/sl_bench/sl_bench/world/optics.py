@@ -12,6 +12,29 @@ BITS = (8, 10, 12)
 FULL_SCALE_DN = 255.0
 
 
+def check_ranges(settings: object, where: str, **ranges: tuple[float, float]) -> None:
+    """Check numbers among settings.
+
+    Parameters
+    ----------
+    settings : object
+        Has them as attributes.
+    where : str
+        What they belong to, for the message.
+    **ranges
+        Least and greatest value of each.
+
+    Raises
+    ------
+    ConfigError
+        When one is out of its range, or NaN.
+    """
+    for name, (low, high) in ranges.items():
+        value = getattr(settings, name)
+        if not low <= value <= high:
+            raise ConfigError(f"{where}: {name}={value}; expected {low:g} to {high:g}")
+
+
 @dataclass(frozen=True)
 class Optics:
     """The photon chain and the blurs of the bench.
@@ -55,22 +78,20 @@ class Optics:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("projector_blur_px", 0.2, 5.0),
-            ("lens_blur_px", 0.2, 5.0),
-            ("projector_defocus_px_per_m", 0.0, 1e5),
-            ("lens_defocus_px_per_m", 0.0, 1e5),
-            ("full_well_e", 100.0, 1e7),
-            ("read_noise_dn", 0.0, 50.0),
-            ("white_dn", 0.0, 1e5),
-            ("nominal_exposure_s", 1e-6, 100.0),
-            ("ambient", 0.0, 10.0),
-            ("uneven_light", 0.0, 0.9),
-            ("vignetting", 0.0, 0.9),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ConfigError(f"optics: {name}={value}; expected {low:g} to {high:g}")
+        check_ranges(
+            self,
+            "optics",
+            projector_blur_px=(0.2, 5.0),
+            lens_blur_px=(0.2, 5.0),
+            projector_defocus_px_per_m=(0.0, 1e5),
+            lens_defocus_px_per_m=(0.0, 1e5),
+            full_well_e=(100.0, 1e7),
+            read_noise_dn=(0.0, 50.0),
+            white_dn=(0.0, 1e5),
+            ambient=(0.0, 10.0),
+            uneven_light=(0.0, 0.9),
+            vignetting=(0.0, 0.9),
+        )
         if self.bits not in BITS:
             raise ConfigError(f"optics: bits={self.bits}; expected one of {BITS}")
 
