@@ -68,8 +68,10 @@ def start(directory: Path, config: str = CONFIG) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
     )  # fmt: skip
     assert process.stdout is not None
-    line = process.stdout.readline()
-    assert line == "bench ready\n", process.communicate(timeout=patience(READY_S))
+    said = [process.stdout.readline().strip() for _ in range(2)]
+    assert said == ["bench compiling", "bench ready"], process.communicate(
+        timeout=patience(READY_S)
+    )
     return process
 
 

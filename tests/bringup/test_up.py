@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from sl_bringup.graph.graph import is_running, lock_directory
+from sl_bringup.graph.graph import Graph, GraphOptions, is_running, lock_directory
 from sl_bringup.graph.graph_config import NODES, Changes, find_config, started_nodes, write_config
 from sl_bringup.graph.supervisor import Process, Supervisor, Timing
 from sl_common.errors import ConfigError
@@ -235,3 +235,30 @@ def test_a_camera_or_stage_without_a_section_is_not_started(tmp_path: Path) -> N
     source.write_text("/sl/stage:\n  ros__parameters: {kind: manual}\n")
     assert sorted(started_nodes(source)) == sorted([*others, "stage"])
     assert started_nodes(find_config("hardware.yaml")) == NODES
+
+
+@pytest.mark.parametrize(
+    ("lines", "deaths", "expected"),
+    [(["bench compiling"], 0, True), ([], 0, False), (["bench compiling"], 1, False)],
+)
+def test_the_bench_may_compile_for_longer_than_the_timeout(
+    lines: list[str], deaths: int, expected: bool
+) -> None:
+    """It says ready after three time-outs; a bench that does not compile, or dies, is given up."""
+
+    async def work() -> bool:
+        told = Told()
+        graph = Graph(GraphOptions(bench=True), told)
+        graph.supervisor.starts["bench"] = 1
+        for line in lines:
+            graph._listen(line)
+        answer = asyncio.create_task(graph._await_bench(0.1))
+        await asyncio.sleep(0.05)
+        graph.supervisor.starts["bench"] += deaths
+        await asyncio.sleep(0.3)
+        graph._listen("bench ready")
+        found = await answer
+        assert told.count("the bench does not answer") == (not found)
+        return found
+
+    assert asyncio.run(work()) is expected

@@ -1,9 +1,9 @@
 """The process that stands in for the hardware: one world, three emulators, a control socket.
 
-``python -m sl_bench.process.bench --config FILE --runtime-dir DIR`` says ``bench ready`` when all
-endpoints accept: ``usb.sock`` (the DLPC900), ``camera.sock`` (or GigE Vision, see
-`BenchSettings.camera_gige`), ``stage`` (a serial port) and ``control.sock`` in the runtime
-directory. It ends on SIGINT or SIGTERM and removes them.
+``python -m sl_bench.process.bench --config FILE --runtime-dir DIR`` says ``bench compiling`` when
+it starts and ``bench ready`` when all endpoints accept: ``usb.sock`` (the DLPC900), ``camera.sock``
+(or GigE Vision, see `BenchSettings.camera_gige`), ``stage`` (a serial port) and ``control.sock`` in
+the runtime directory. It ends on SIGINT or SIGTERM and removes them.
 """
 
 from __future__ import annotations
@@ -308,10 +308,15 @@ def _serve(settings: BenchSettings, runtime_dir: str) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
     os.nice(settings.niceness)
+    _say("bench compiling")  # or finding it done
     with Bench(settings, runtime_dir):
-        sys.stdout.write("bench ready\n")
-        sys.stdout.flush()
+        _say("bench ready")
         ended.wait()
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

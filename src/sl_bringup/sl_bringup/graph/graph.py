@@ -105,6 +105,7 @@ class Graph:
         self._tell = tell
         self.supervisor = Supervisor(tell)
         self._bench_ready = asyncio.Event()
+        self._bench_compiling = False
         self._lock: IO[str] | None = None
         self._client: asyncio.subprocess.Process | None = None
 
@@ -138,23 +139,31 @@ class Graph:
         await self._stop()
 
     async def ready(self, timeout_s: float) -> bool:
-        """Wait until bench, nodes and services are up; each thing that is missing is told.
+        """Wait until bench, nodes and services are up; each thing that is missing is reported.
 
         Parameters
         ----------
         timeout_s : float
-            Give up after so long; 0: never.
+            Give up when something has been missing for this long; 0: never. The time in which
+            only the compiler is waited for does not count.
         """
         wanted = ("--nodes", *self._options.nodes, "--timeout", f"{timeout_s}")
-        if await self.run_client("sl_bringup.ready_node", *wanted) != 0:
+        if await self.run_client("sl_bringup.ready_node", *wanted, "--wait-for-compiler") != 0:
             return False
-        if self._options.bench:
+        return not self._options.bench or await self._await_bench(timeout_s)
+
+    async def _await_bench(self, timeout_s: float) -> bool:
+        """Wait for the bench; while it compiles and does not die, for as long as it takes."""
+        starts = self.supervisor.starts.get("bench")
+        while True:
             try:
                 await asyncio.wait_for(self._bench_ready.wait(), timeout_s or None)
+                return True
             except TimeoutError:
-                self._tell("graph not ready: the bench does not answer")
-                return False
-        return True
+                died = self.supervisor.starts.get("bench") != starts
+                if died or not self._bench_compiling:
+                    self._tell("graph not ready: the bench does not answer")
+                    return False
 
     async def run_client(self, module: str, *arguments: str) -> int:
         """Run a ROS client of this graph to its end, return its exit status."""
@@ -197,14 +206,17 @@ class Graph:
         return config
 
     def _start_bench(self, config: Path) -> None:
-        def listen(line: str) -> None:
-            if line.strip() == "bench ready":
-                self._bench_ready.set()
-
         directory = str(self._options.directory)
         command = (sys.executable, "-m", "sl_bench.process.bench", "--config", str(config),
                    "--runtime-dir", directory)  # fmt: skip
-        self.supervisor.start(Process("bench", command, process_environment({}), listen))
+        self.supervisor.start(Process("bench", command, process_environment({}), self._listen))
+
+    def _listen(self, line: str) -> None:
+        """Take from the bench's lines how far it is."""
+        if line.strip() == "bench compiling":
+            self._bench_compiling = True
+        elif line.strip() == "bench ready":
+            self._bench_ready.set()
 
     def _start_node(self, name: str, module: str, config: Path) -> None:
         command = (sys.executable, "-m", module, "--ros-args", "--params-file", str(config),
