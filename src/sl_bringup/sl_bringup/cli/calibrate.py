@@ -79,7 +79,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument(
         "--ready-timeout", type=float, default=240.0, metavar="S",
-        help="with --up: for the graph to get ready (default: 240)",
+        help="with --up: for the graph to get ready, compiling apart (default: 240)",
     )  # fmt: skip
     add_graph_arguments(parser)
     parser.set_defaults(run=run)

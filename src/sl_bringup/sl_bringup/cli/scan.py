@@ -57,7 +57,7 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--ready-timeout", type=float, default=240.0, metavar="S",
-        help="with --up: for the graph to get ready (default: 240)",
+        help="with --up: for the graph to get ready, compiling apart (default: 240)",
     )  # fmt: skip
     parser.add_argument("--verbose", action="store_true", help="with --up: show the graph's log")
     add_graph_arguments(parser)
