@@ -20,7 +20,7 @@ from sl_bench.world.world import World
 from sl_bringup.bag.bag_writer import new_bag
 from sl_bringup.bag.bags import open_bag, typestore
 from sl_bringup.bag.mcap_writer import McapWriter
-from sl_bringup.evaluation.evaluation import Choices, Crew, evaluate_bag
+from sl_bringup.evaluation.evaluate_bag import Choices, Crew, evaluate_bag
 from sl_common.topics import EVALUATED_TOPICS
 from sl_projector.sequence.pattern_sequence import named
 from sl_reconstruct.model.calibration_file import Calibration

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from sl_bringup.results.pictures import png
+from sl_common.pages.figure_png import png
 
 #: Part of a flank that is drawn enlarged, metres.
 DETAIL_M = (1.0e-3, 1.25e-3)

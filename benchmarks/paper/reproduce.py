@@ -25,10 +25,10 @@ from sl_bench.world.reference_rig import reference_rig
 from sl_bench.world.surfaces import make_surface
 from sl_bench.world.world import World
 from sl_bringup.graph.console import complain, say
-from sl_bringup.results.pictures import relief_picture, section_picture
-from sl_bringup.results.report import write_json
+from sl_bringup.results.scan_pictures import relief_picture, section_picture
 from sl_common.documents import written_atomically
 from sl_common.errors import SlError
+from sl_common.json_file import write_json
 from sl_projector.sequence.pattern_sequence import PatternSequence, named
 from sl_reconstruct.cloud.height_map import make_height_map
 from sl_reconstruct.measure.groove import measure_groove

@@ -15,7 +15,7 @@ from plyfile import PlyData
 
 from sl_bringup.bag.bag_writer import new_bag
 from sl_bringup.cli.main import main
-from sl_bringup.evaluation.overrides import parse_choices
+from sl_bringup.evaluation.settings_overrides import parse_choices
 from sl_common.errors import ConfigError
 from sl_projector.sequence.pattern_sequence import PatternSequence
 from sl_reconstruct.model.calibration_file import Calibration, rig_hash, save_calibration

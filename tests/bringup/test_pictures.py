@@ -7,7 +7,7 @@ import pytest
 from matplotlib import colormaps
 from matplotlib.colors import to_hex, to_rgb
 
-from sl_bringup.results.pictures import (
+from sl_bringup.results.scan_pictures import (
     ABSENT_COLOUR,
     MISSING_COLOUR,
     PRESENT_COLOUR,
@@ -20,7 +20,7 @@ from sl_bringup.results.pictures import (
     relief_picture,
     residual_picture,
 )
-from sl_bringup.results.report import micrometres
+from sl_common.pages.page import length
 from sl_reconstruct.cloud.cloud_writer import POINT_FIELDS
 from sl_reconstruct.cloud.height_map import HeightMap
 from support.png_files import pixels
@@ -159,6 +159,6 @@ def test_level_and_empty_maps_are_drawn(value: float) -> None:
 
 
 def test_lengths_for_people() -> None:
-    assert micrometres(1.23456e-7) == "0.1235 µm"
-    assert micrometres(2.5e-3) == "2.5 mm"
-    assert micrometres(float("nan")) == "unknown"
+    assert length(1.23456e-7) == "0.1235 µm"
+    assert length(2.5e-3) == "2.5 mm"
+    assert length(float("nan")) == "unknown"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -140,7 +141,7 @@ def test_the_report_names_every_figure_and_its_limit(checked: Checked) -> None:
     checked.stretch = 1.002
     found = checked.verify()
     page = Path(found.report).read_text()
-    assert "Planes off the stage&#x27;s steps" in page
+    assert "Planes off the stage's steps" in html.unescape(page)
     assert page.count("data:image/png;base64,") == 1
     content = json.loads(Path(found.report).with_suffix(".json").read_text())
     assert content["recalibrate"] is True

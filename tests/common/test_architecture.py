@@ -33,6 +33,7 @@ ALLOWED = {
 }
 #: What each room may import of its own package; a package's top (nodes, messages) may import all.
 ROOMS = {
+    "sl_common": {"pages": set()},
     "sl_projector": {"sequence": set(), "hid": set(), "dlpc": {"hid", "sequence"}},
     "sl_camera": {
         "camera": set(), "drivers": {"camera"}, "stage": set(), "stage.grbl": {"stage"},
@@ -234,9 +235,9 @@ def test_one_version_everywhere() -> None:
 
 #: What rosdep calls the libraries; llvmlite is a part of numba, others come from pip.
 KEYS = {
-    "cv2": "python3-opencv", "matplotlib": "python3-matplotlib", "numba": "python3-numba",
-    "numpy": "python3-numpy", "scipy": "python3-scipy", "serial": "python3-serial",
-    "usb": "python3-usb", "yaml": "python3-yaml",
+    "cv2": "python3-opencv", "jinja2": "python3-jinja2", "matplotlib": "python3-matplotlib",
+    "numba": "python3-numba", "numpy": "python3-numpy", "scipy": "python3-scipy",
+    "serial": "python3-serial", "usb": "python3-usb", "yaml": "python3-yaml",
 }  # fmt: skip
 
 

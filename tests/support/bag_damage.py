@@ -19,7 +19,7 @@ from test_evaluate_many import START_NS, write_scans
 from sl_bringup.bag.bag_recorder import BagRecorder
 from sl_bringup.bag.bag_writer import new_bag, topic_qos
 from sl_bringup.bag.bags import open_bag
-from sl_bringup.evaluation.evaluation import Choices, Crew, evaluate_bag
+from sl_bringup.evaluation.evaluate_bag import Choices, Crew, evaluate_bag
 from sl_common.errors import SlError
 from sl_common.topics import CALIBRATION, EVALUATED_TOPICS
 from sl_reconstruct.cloud.cloud_reader import read_cloud

@@ -17,7 +17,7 @@ from sl_interfaces.msg import ScanReport
 
 from sl_bringup.client_node import GraphClient, run_client
 from sl_bringup.graph.console import complain, say
-from sl_bringup.results.scan_result import MEASURES, check_cloud, live_report, summary, write_result
+from sl_bringup.results.live_scan import MEASURES, check_cloud, live_report, summary, write_result
 from sl_common import topics
 from sl_reconstruct.messages import cloud_from_msg, refusals_from_msg
 
@@ -145,7 +145,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         client = ScanClient(args.namespace)
         client.connect(args.connect_timeout)
         if not args.no_pictures:
-            _import_meanwhile("sl_bringup.results.pictures")
+            _import_meanwhile("sl_bringup.results.scan_pictures")
         goal = Scan.Goal(sequence=args.sequence, exposure_s=args.exposure, max_repeats=args.repeats)
         result, cloud = client.scan(goal, args.timeout)
         client.end_line()

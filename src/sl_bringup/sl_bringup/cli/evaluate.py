@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sl_bringup.bag.bags import open_bag
-from sl_bringup.evaluation.evaluation import (
+from sl_bringup.evaluation.evaluate_bag import (
     Choices,
     Crew,
     Pictures,
@@ -20,10 +20,10 @@ from sl_bringup.evaluation.evaluation import (
     evaluate_bag,
     is_good,
 )
-from sl_bringup.evaluation.overrides import parse_choices
+from sl_bringup.evaluation.settings_overrides import parse_choices
 from sl_bringup.evaluation.sweep import Variant, variants, write_sweep
 from sl_bringup.graph.console import ProgressLine, complain, say
-from sl_bringup.results.result_folder import live_line
+from sl_bringup.results.evaluation_folder import live_line
 from sl_common.errors import BagError, ConfigError, SlError
 
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from sl_bringup.graph.console import say
-from sl_bringup.results.report import write_json
 from sl_common.documents import written_atomically
 from sl_common.errors import ConfigError, StackError
+from sl_common.json_file import write_json
 from sl_reconstruct.cloud.cloud_reader import read_cloud, read_height_map
 from sl_reconstruct.cloud.height_map import make_height_map
 from sl_reconstruct.cloud.x3p_writer import save_x3p
@@ -174,7 +174,7 @@ def _write_x3p(path: Path, points: Points, cloud: Path) -> None:
 
 def _draw(path: Path, points: Points, found: Measurement, title: str) -> None:
     """Draw a section or a map of deviations; of other measurements there is nothing to draw."""
-    from sl_bringup.results.pictures import residual_picture, section_picture  # half a second
+    from sl_bringup.results.scan_pictures import residual_picture, section_picture  # half a second
 
     if isinstance(found, ProfileMeasurement):
         ends = " to ".join(f"({1e3 * x:g}, {1e3 * y:g})" for x, y in (found.from_m, found.to_m))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from sl_bringup.results.report import micrometres, page, write_json
 from sl_common.documents import write_text
 from sl_common.errors import ConfigError
+from sl_common.json_file import write_json
+from sl_common.pages.page import length, number, render_page
 from sl_reconstruct.cloud.cloud_reader import read_cloud
 
 #: Standard deviation over the median of absolute values, of a normal distribution.
@@ -22,10 +21,9 @@ MAD = 1.4826
 #: More would be a mistake: each is a whole evaluation.
 MAX_VARIANTS = 64
 PICTURES = ("picture_residual.png", "picture_refusals.png")
-COLUMNS = (
-    "scans", "good", "points", "of the lit", "sigma of z", "noise / bound", "plane rms",
-    "z off first",
-)  # fmt: skip
+COLUMNS = ("scans", "good", "points", "of the lit", "sigma of z", "noise / bound", "plane rms",
+           "z off first")  # fmt: skip
+_TEMPLATE = Path(__file__).parent / "templates" / "sweep.html"
 
 
 @dataclass(frozen=True)
@@ -102,16 +100,15 @@ def write_sweep(
         for (v, found), cloud in zip(results, clouds, strict=True)
     ]
     write_json(output / "sweep.json", {"format": 1, "common": list(common), "variants": rows})
-    titles = [variant.title for variant, _ in results]
-    cells = [_cells(row) for row in rows]
-    pictures = [_pictures(found) for _, found in results]
-    write_text(output / "sweep.html", page("Sweep", _parts(titles, cells, pictures, common)))
-    width = max(len(title) for title in [*titles, "settings"])
-    lines = [f"{'settings':<{width}}" + "".join(f"{c:>16}" for c in COLUMNS)]
-    return lines + [
-        f"{title:<{width}}" + "".join(f"{cell:>16}" for cell in row)
-        for title, row in zip(titles, cells, strict=True)
+    shown = [
+        {"title": variant.title, "cells": _cells(row), "pictures": _pictures(found)}
+        for (variant, found), row in zip(results, rows, strict=True)
     ]
+    page = render_page(_TEMPLATE, title="Sweep", columns=COLUMNS, variants=shown, common=common)
+    write_text(output / "sweep.html", page)
+    table = [("settings", COLUMNS), *((v["title"], v["cells"]) for v in shown)]
+    width = max(len(title) for title, _ in table)
+    return [f"{title:<{width}}" + "".join(f"{cell:>16}" for cell in row) for title, row in table]
 
 
 def _row(reports: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -153,18 +150,15 @@ def _middle(values: Sequence[float]) -> float:
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
-    def told(value: float, text: str) -> str:
-        return text.format(value) if np.isfinite(value) else "-"
-
     return [
         f"{row['scans']}",
         f"{row['good']}",
-        told(row["points"], "{:,.0f}"),
-        told(100 * row["present_fraction"], "{:.2f} %"),
-        micrometres(row["median_sigma_m"]),
-        told(row["bound_ratio"], "{:.3f}"),
-        micrometres(row["plane_rms_m"]),
-        micrometres(row["z_off_first_m"]) if np.isfinite(row["z_off_first_m"]) else "-",
+        number(row["points"], ",.0f", missing="-"),
+        number(row["present_fraction"], ".2f %", 100, "-"),
+        length(row["median_sigma_m"]),
+        number(row["bound_ratio"], ".3f", missing="-"),
+        length(row["plane_rms_m"]),
+        length(row["z_off_first_m"]) if np.isfinite(row["z_off_first_m"]) else "-",
     ]
 
 
@@ -175,32 +169,3 @@ def _pictures(found: Sequence[tuple[Path, Mapping[str, Any]]]) -> list[bytes]:
         if all(file.is_file() for file in files):
             return [file.read_bytes() for file in files]
     return []
-
-
-def _parts(
-    titles: Sequence[str],
-    cells: Sequence[Sequence[str]],
-    pictures: Sequence[Sequence[bytes]],
-    common: Sequence[str],
-) -> list[str]:
-    """The page: the table, then each variant's pictures."""
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in ("settings", *COLUMNS))
-    rows = "".join(
-        f"<tr><th>{html.escape(title)}</th>"
-        + "".join(f'<td class="n">{html.escape(cell)}</td>' for cell in row)
-        + "</tr>"
-        for title, row in zip(titles, cells, strict=True)
-    )
-    parts = ["<h1>Sweep</h1>", f"<table><tr>{head}</tr>{rows}</table>",
-             "<p>Medians over the scans of each variant; z off first: scatter of z about that of "
-             "the first variant, at the points of the first scan that both have.</p>"]  # fmt: skip
-    if common:
-        parts.append(f"<p>All with {html.escape(', '.join(common))}.</p>")
-    for title, shown in zip(titles, pictures, strict=True):
-        parts.append(f"<h2>{html.escape(title)}</h2>")
-        parts += [
-            f'<img alt="{html.escape(title)}" '
-            f'src="data:image/png;base64,{base64.b64encode(png).decode()}">'
-            for png in shown
-        ]
-    return parts

@@ -57,9 +57,9 @@ def write_scan(
     title = f"{report['bag']}, scan {report['scan_id']}"
     drawn = {} if cloud is None else _write_cloud(folder, report, cloud, with_pictures, title)
     if with_pictures and images is not None and "saturation_dn" in report:
-        from sl_bringup.results import pictures
+        from sl_bringup.results.scan_pictures import contrast_picture
 
-        contrast = pictures.contrast_picture(images, report["saturation_dn"], title)
+        contrast = contrast_picture(images, report["saturation_dn"], title)
         drawn["picture_contrast"] = "Pattern contrast", contrast
     for name, (_, png) in drawn.items():
         with written_atomically(folder / f"{name}.png") as partial:
@@ -126,36 +126,29 @@ def _height_map(folder: Path, cloud: Cloud, report: dict[str, Any]) -> HeightMap
 
 def _draw(cloud: Cloud, height: HeightMap | None, plane: Plane | None, title: str) -> Drawn:
     """Pictures by file name, each with its caption."""
-    from sl_bringup.results import (
-        pictures,  # imported late: half a second that clouds alone do without
-    )
+    # Imported late: matplotlib takes half a second, which clouds alone do without.
+    from sl_bringup.results import scan_pictures as draw
 
     drawn = {}
     if height is not None:
-        drawn["picture_height"] = "Height map", pictures.height_picture(height, title)
-        drawn["picture_relief"] = "Shaded relief", pictures.relief_picture(height, title)
+        drawn["picture_height"] = "Height map", draw.height_picture(height, title)
+        drawn["picture_relief"] = "Shaded relief", draw.relief_picture(height, title)
     if height is not None and plane is not None:
-        told = f"{title}\ndeviation from the best plane"
-        picture = pictures.residual_picture(height, _deviation_m(height, plane), told)
-        drawn["picture_residual"] = "Deviation from the best plane", picture
+        caption = "Deviation from the best plane"
+        subtitle = f"{title}\n{caption.lower()}"
+        picture = draw.residual_picture(height, _deviation_m(height, plane), subtitle)
+        drawn["picture_residual"] = caption, picture
     if cloud.present:
-        drawn["picture_profile"] = "Section", pictures.profile_picture(cloud.points, title)
-    # A live scan's map of them is a message of its own, which may be missing.
+        drawn["picture_profile"] = "Section", draw.profile_picture(cloud.points, title)
+    # The map of a live scan comes in a message of its own, which may be missing.
     if bool((cloud.reason > Reason.UNLIT).any()) or not any(cloud.refused.values()):
-        drawn["picture_refusals"] = (
-            "Why points are missing",
-            pictures.refusal_picture(
-                cloud.reason, tuple(REFUSALS.values()), _counts(cloud),
-                f"{title}\nwhy points are missing",
-            ),
-        )  # fmt: skip
+        caption = "Why points are missing"
+        unlit = cloud.reason.size - cloud.lit
+        counts = {"points": cloud.present, "not lit": unlit, **cloud.refused}
+        names, subtitle = tuple(REFUSALS.values()), f"{title}\n{caption.lower()}"
+        picture = draw.refusal_picture(cloud.reason, names, counts, subtitle)
+        drawn["picture_refusals"] = caption, picture
     return drawn
-
-
-def _counts(cloud: Cloud) -> dict[str, int]:
-    return {
-        "points": cloud.present, "not lit": cloud.reason.size - cloud.lit, **cloud.refused,
-    }  # fmt: skip
 
 
 def _deviation_m(height: HeightMap, plane: Plane) -> Any:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sl_calibration.solve.point_uncertainty import EdgeNoise, sigma_map
 from sl_calibration.solve.solution import metres_per_pixel
+from sl_common.pages.figure_png import png
 
 if TYPE_CHECKING:
     from sl_calibration.solve.solution import JudgedSolution
@@ -26,38 +25,22 @@ _MM = 1e3
 _MOST_ARROWS = 600
 
 
-def png(figure: Figure) -> bytes:
-    """Picture of a figure."""
-    buffer = io.BytesIO()
-    # Not `savefig`: that draws twice, once for the layout.
-    FigureCanvasAgg(figure).print_png(buffer)  # type: ignore[no-untyped-call]
-    return buffer.getvalue()
-
-
 def _figure(width: float, height: float) -> Figure:
     return Figure((width, height), dpi=DPI, layout="constrained")
 
 
 def pictures(solved: JudgedSolution) -> Iterator[tuple[str, bytes]]:
-    """Caption and PNG of every picture of the report, in its order."""
-    made: tuple[tuple[str, Callable[[JudgedSolution], Figure]], ...] = (
-        ("Residuals at each height, on the part (the paper's Fig. 6)", residuals_by_height),
-        ("Residual vectors", residual_vectors),
-        ("Coverage: where holes and targets were measured", coverage),
-        ("Predicted 1-sigma of z of a triangulated point", uncertainty),
-        ("Each height, predicted by the others", left_out),
-    )
-    for caption, draw in made:
-        yield caption, png(draw(solved))
-
-
-def camera_pictures(solved: JudgedSolution) -> Iterator[tuple[str, bytes]]:
-    """The same of a camera alone."""
-    made: tuple[tuple[str, Callable[[JudgedSolution], Figure]], ...] = (
-        ("Residuals at each height, on the part (the paper's Fig. 6)", residuals_by_height),
-        ("Residual vectors", residual_vectors),
-        ("Coverage: where holes were measured", coverage),
-    )
+    """Caption and PNG of every picture of the report, in its order; fewer for a camera alone."""
+    rig = len(solved.names) > 1
+    holes = "holes and targets" if rig else "holes"
+    made: list[tuple[str, Callable[[JudgedSolution], Figure]]] = [
+        ("Residuals at each height, on the part (the paper's Fig. 6)", _residuals_by_height),
+        ("Residual vectors", _residual_vectors),
+        (f"Coverage: where {holes} were measured", _coverage),
+    ]
+    if rig:
+        made.append(("Predicted 1-sigma of z of a triangulated point", _uncertainty))
+        made.append(("Each height, predicted by the others", _left_out))
     for caption, draw in made:
         yield caption, png(draw(solved))
 
@@ -92,7 +75,7 @@ class _Group:
         return np.asarray(np.hypot(*self.residuals_px.T) * self.metres)
 
 
-def residuals_by_height(solved: JudgedSolution) -> Figure:
+def _residuals_by_height(solved: JudgedSolution) -> Figure:
     """Every residual's length over the height, with the rms of each height and the noise floor."""
     figure, panels = _panels(solved, 3.6)
     for i, axes in enumerate(panels):
@@ -114,7 +97,7 @@ def residuals_by_height(solved: JudgedSolution) -> Figure:
     return figure
 
 
-def residual_vectors(solved: JudgedSolution) -> Figure:
+def _residual_vectors(solved: JudgedSolution) -> Figure:
     """Residuals as arrows in both images, coloured by height."""
     figure, panels = _panels(solved, 4.6)
     for i, axes in enumerate(panels):
@@ -136,7 +119,7 @@ def residual_vectors(solved: JudgedSolution) -> Figure:
     return figure
 
 
-def coverage(solved: JudgedSolution) -> Figure:
+def _coverage(solved: JudgedSolution) -> Figure:
     """Where both devices were measured, all heights together."""
     figure, panels = _panels(solved, 4.3)
     for i, axes in enumerate(panels):
@@ -155,7 +138,7 @@ def _image_axes(axes: Any, size: tuple[int, int]) -> None:
     axes.set(xlim=(0, size[0]), ylim=(size[1], 0), xlabel="u, px", ylabel="v, px", aspect="equal")
 
 
-def uncertainty(solved: JudgedSolution) -> Figure:
+def _uncertainty(solved: JudgedSolution) -> Figure:
     """Maps of sigma z at the lowest, the middle and the highest height: calibration, with noise."""
     volume = solved.solution.lit_volume
     figure = _figure(11, 5.6)
@@ -178,7 +161,7 @@ def uncertainty(solved: JudgedSolution) -> Figure:
     return figure
 
 
-def left_out(solved: JudgedSolution) -> Figure:
+def _left_out(solved: JudgedSolution) -> Figure:
     """Error of z at each height when the calibration is made without it."""
     figure = _figure(6, 3)
     axes = figure.subplots()

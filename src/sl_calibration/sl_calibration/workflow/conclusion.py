@@ -9,7 +9,7 @@ from typing import Any
 from sl_calibration.data.observations import Observations, load_observations
 from sl_calibration.data.run_store import CALIBRATION, CAMERA, CAMERA_PAGE, OBSERVATIONS, PAGE
 from sl_calibration.data.session import CalibrationProgress, Tell
-from sl_calibration.report.calibration_report import write_camera_report, write_report
+from sl_calibration.report.calibration_report import write_report
 from sl_calibration.report.camera_file import save_camera
 from sl_calibration.solve.acceptance import Limits
 from sl_calibration.solve.solution import JudgedSolution, metres_per_pixel
@@ -140,7 +140,7 @@ def _conclude_camera(observations: Observations, limits: Limits, folder: Path) -
     """Solve the camera alone; its file and page stand beside those of a rig, if there are any."""
     solved = solve_camera_alone(observations, limits)
     save_camera(folder / CAMERA, solved.bundle, observations.made_from)
-    write_camera_report(folder, solved)
+    write_report(folder, solved, None)
     accepted = solved.verdict.passed
     message = (
         "accepted: the camera is calibrated and stored; it is not in force, for there is no "

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import html
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sl_bringup.results.report import page, verdict_line, write_json
 from sl_bringup.results.scan_files import clear_scan
+from sl_bringup.results.scan_page import banner
 from sl_common.documents import write_text
 from sl_common.errors import ConfigError
+from sl_common.json_file import write_json
+from sl_common.pages.page import render_page
 
+_TEMPLATE = Path(__file__).parent / "templates" / "evaluation.html"
+#: What the summary repeats of each scan's report.
 SUMMARY_KEYS = (
-    "scan_id", "folder", "good", "complete", "reasons", "points", "median_sigma_m", "cloud_hash",
-    "calibration_hash", "settings_hash", "live",
-)  # fmt: skip
+    *("scan_id", "folder", "good", "complete", "reasons", "points", "median_sigma_m"),
+    *("cloud_hash", "calibration_hash", "settings_hash", "live"),
+)
 
 
 def clear_results(output: Path) -> None:
@@ -63,24 +66,20 @@ def write_summary(
     scans = [{key: report[key] for key in SUMMARY_KEYS if key in report} for report in reports]
     content = {"format": 1, "bag": name, "lost": lost, "notes": notes}
     write_json(output / "summary.json", {**content, "live": count_live(reports), "scans": scans})
-    parts = [f"<h1>{html.escape(name)}</h1>", f"<p>{html.escape(live_line(reports))}</p>"]
-    parts += [f'<p class="verdict bad">Lost: {html.escape(line)}</p>' for line in lost]
-    parts += [f"<p>Note: {html.escape(line)}</p>" for line in notes]
-    for report in reports:
-        title = report["folder"]
-        if (output / title / "report.html").is_file():
-            title = f'<a href="{title}/report.html">{title}</a>'
-        parts.append(f"<h2>{title}</h2>")
-        parts.append(verdict_line(report))
-    write_text(output / "index.html", page(name, parts))
+    folders = [str(report["folder"]) for report in reports]
+    has_page = [(output / folder / "report.html").is_file() for folder in folders]
+    shown = zip(folders, has_page, map(banner, reports), strict=True)
+    page = render_page(
+        _TEMPLATE, title=name, live=live_line(reports), lost=lost, notes=notes, scans=shown
+    )
+    write_text(output / "index.html", page)
 
 
 def count_live(reports: Sequence[Mapping[str, Any]]) -> dict[str, int]:
     """Scans whose cloud has the live cloud's hash, another one, or none to compare with."""
     found = [report.get("live", {}).get("agrees") for report in reports]
-    return {
-        "same": found.count(True), "different": found.count(False), "unknown": found.count(None)
-    }  # fmt: skip
+    kinds = {"same": True, "different": False, "unknown": None}
+    return {name: found.count(agrees) for name, agrees in kinds.items()}
 
 
 def live_line(reports: Sequence[Mapping[str, Any]]) -> str:

@@ -20,14 +20,15 @@ from sl_bringup.bag.bags import Bag, open_bag, topic_names
 from sl_bringup.bag.recorded_calibrations import Calibrations, InForce
 from sl_bringup.bag.recorded_settings import read_settings
 from sl_bringup.evaluation.live_comparison import LiveResults
-from sl_bringup.evaluation.overrides import parse_choices
+from sl_bringup.evaluation.settings_overrides import parse_choices
 from sl_bringup.graph.version import software_version
-from sl_bringup.results.report import write_json, write_page
-from sl_bringup.results.result_folder import clear_results, write_summary
+from sl_bringup.results.evaluation_folder import clear_results, write_summary
 from sl_bringup.results.scan_files import write_scan
+from sl_bringup.results.scan_page import write_page
 from sl_camera.sync.match_events import FrameDecision, Status
 from sl_camera.sync.matching import StackMatcher
 from sl_common.errors import BagError, CalibrationError, SlError
+from sl_common.json_file import write_json
 from sl_common.topics import TRIGGER
 from sl_projector.sequence.stack import Stack
 from sl_reconstruct.cloud.cloud import Cloud, median

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LightSource, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from sl_common.pages.figure_png import png
 from sl_reconstruct.cloud.height_map import HeightMap
 from sl_reconstruct.measure.profile import ProfileMeasurement
 
@@ -265,12 +264,3 @@ def broken_at_gaps(x: NDArray[Any], *values: NDArray[Any]) -> tuple[NDArray[Any]
         return (x, *values)
     gaps = np.flatnonzero(apart > 5 * np.median(apart)) + 1
     return tuple(np.insert(v.astype(np.float64), gaps, np.nan) for v in (x, *values))
-
-
-def png(figure: Figure) -> bytes:
-    """PNG of a figure, drawn without a display."""
-    buffer = io.BytesIO()
-    # Not `savefig`: that draws twice, once for the layout.
-    canvas = FigureCanvasAgg(figure)
-    canvas.print_png(buffer, pil_kwargs={"compress_level": 4})  # type: ignore[no-untyped-call]
-    return buffer.getvalue()

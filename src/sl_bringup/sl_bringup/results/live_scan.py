@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from sl_bringup.graph.version import software_version
 from sl_bringup.results.paper_tables import table_2_lines
-from sl_bringup.results.report import micrometres, write_json, write_page
 from sl_bringup.results.scan_files import write_scan
+from sl_bringup.results.scan_page import included_angle, write_page
+from sl_common.json_file import write_json
+from sl_common.pages.page import length
 from sl_reconstruct.cloud.cloud import CLOUD_DTYPE, Cloud
 from sl_reconstruct.cloud.cloud_writer import cloud_hash
 from sl_reconstruct.cloud.refusals import Reason
 from sl_reconstruct.measure.groove import measure_groove
 from sl_reconstruct.measure.plane_angle import AngleMeasurement
-from sl_reconstruct.measure.result import rounded
 
 MEASURES = ("groove",)
 
@@ -143,7 +144,7 @@ def summary(report: Mapping[str, Any]) -> Iterator[str]:
         f"points            {report['points']:,} of {report['lit_positions']:,} lit positions "
         f"({100 * report['present_fraction']:.2f} %)"
     )
-    yield f"sigma of z        {micrometres(report['median_sigma_m'])} (median of the stated ones)"
+    yield f"sigma of z        {length(report['median_sigma_m'])} (median of the stated ones)"
     if "bound_ratio" in report["figures"]:
         ratio = report["figures"]["bound_ratio"]
         yield f"edge noise        {ratio:.3f} x the bound for white noise"
@@ -172,9 +173,8 @@ def _groove_lines(report: Mapping[str, Any]) -> Iterator[str]:
         x, y, z = plane["normal"]
         yield (
             f"{side + ' flank':<18}normal ({x:+.5f}, {y:+.5f}, {z:+.5f}), "
-            f"rms {micrometres(plane['rms_m'])}, {plane['points']:,} points"
+            f"rms {length(plane['rms_m'])}, {plane['points']:,} points"
         )
-    angle, u = groove["included_angle_deg"], groove["u_included_angle_deg"]
-    yield f"included angle    {rounded(angle, u)} degrees (standard uncertainty, of noise)"
+    yield f"included angle    {included_angle(report)}"
     yield ""
     yield from table_2_lines(report)

@@ -1,0 +1,1 @@
+"""Pages of reports: one layout and one style for all of them."""
