@@ -48,6 +48,7 @@ class Graph:
         self.tester = GraphNode("tester", namespace=NAMESPACE, context=self.context)
         self.executor.add_node(self.tester)
         self._nodes: list[Any] = []
+        self._clients: list[Any] = []
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._spin)
         self._thread.start()
@@ -110,12 +111,21 @@ class Graph:
         self.tester.listen(topics.DIAGNOSTICS, hear)
         wait(lambda: all(levels.get(n) == b"\0" for n in nodes), f"all well: {levels}", seconds)
 
+    def action_client(self, action: Service) -> Any:
+        """Make a client of an action that is there; destroyed when nothing spins any more."""
+        client = self.tester.action_client(action)
+        self._clients.append(client)
+        assert client.wait_for_server(patience(PATIENCE_S)), f"nobody offers {action.name}"
+        return client
+
     def close(self) -> None:
         """End everything, in the order of a clean shutdown: no callback runs any more."""
         self._ended.set()
         self.executor.create_task(lambda: None)  # wakes it
         self._thread.join(timeout=patience(PATIENCE_S))
         self.executor.shutdown()
+        for client in self._clients:
+            client.destroy()
         for node in self._nodes:
             node.close()
             node.destroy_node()
