@@ -72,6 +72,11 @@ def coin_heights(height_m: float, flank_m: float) -> tuple[Array, float]:
     """Heights (N, N), row 0 at the smallest y, and the grid's step, metres.
 
     Flanks are ``flank_m`` wide, half of it outside the outline, in the form 3 s^2 - 2 s^3.
+
+    Parameters
+    ----------
+    height_m, flank_m : float
+        Height of the relief, and width of its flanks, metres.
     """
     n = round(SIDE_M / STEP_M) + 1
     axis = (np.arange(n, dtype=np.float64) - (n - 1) / 2) * STEP_M

@@ -23,7 +23,15 @@ def rig_document(rig: Rig) -> dict[str, Any]:
 
 
 def write_rig(path: str | Path, rig: Rig) -> None:
-    """Write the rig as a calibration file, in one step."""
+    """Write the rig as a calibration file, in one step.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    rig : Rig
+        The true rig.
+    """
     document = rig_document(rig) | {"made_from": {"bench": "the simulated world's true rig"}}
     write_text(Path(path), dump_document(document))
 

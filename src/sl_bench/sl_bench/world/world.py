@@ -39,7 +39,15 @@ STRIPS_PER_THREAD = 4
 
 
 def in_strips(work: Callable[[tuple[int, int]], None], rows: int) -> None:
-    """Call ``work((first, behind_last))`` for strips that cover all rows, on all cores."""
+    """Call ``work((first, behind_last))`` for strips that cover all rows, on all cores.
+
+    Parameters
+    ----------
+    work : callable
+        Takes the first row of a strip and the one behind its last.
+    rows : int
+        Number of rows.
+    """
     threads = os.cpu_count() or 1
     edges = np.linspace(0, rows, min(threads * STRIPS_PER_THREAD, rows) + 1).astype(int)
     with ThreadPoolExecutor(threads) as pool:
@@ -123,6 +131,13 @@ class World:
     def move(self, rotation: Array, translation_m: Array) -> None:
         """Put the part at a pose, world_from_part; costs nothing until the next frame.
 
+        Parameters
+        ----------
+        rotation : ndarray, (3, 3)
+            World from part.
+        translation_m : ndarray, (3,)
+            The part's origin in the world, metres.
+
         Raises
         ------
         ConfigError
@@ -139,7 +154,15 @@ class World:
             self._scene = Scene(s.surface, s.finish, R, t, s.part_number)
 
     def put(self, surface: Surface, finish: Finish | str | None = None) -> None:
-        """Exchange the part, at the pose where the old one stood; the finish stays unless given."""
+        """Exchange the part, at the pose where the old one stood; the finish stays unless given.
+
+        Parameters
+        ----------
+        surface : Surface
+            The new part.
+        finish : Finish or str, optional
+            Its finish, or the name of one.
+        """
         with self._scene_lock:
             s = self._scene
             new = s.finish if finish is None else _finish(finish)
@@ -350,6 +373,13 @@ class World:
         ``sqrt(lens^2 + (projector / |grad|)^2 + 1/12) |grad| / |grad along the line|``, where grad
         is the gradient of the DMD coordinate over the camera's pixels. NaN where a ray meets
         nothing.
+
+        Parameters
+        ----------
+        q_px : ndarray, (N, 2)
+            Camera pixels.
+        axis : {"column", "row"}
+            Axis of the stripes.
         """
         k, q, o = 0 if axis == "column" else 1, _pixels(q_px), self.optics
         view = self._view(self._scene)

@@ -89,7 +89,19 @@ class BagWriter:
     def trigger(
         self, sequence: PatternSequence, index: int, scan_id: int, stamp_ns: int, exposure_s: float
     ) -> None:
-        """Write that a pattern began to be exposed; see `trigger_to_msg` for the arguments."""
+        """Write that a pattern began to be exposed; see `trigger_to_msg` for the arguments.
+
+        Parameters
+        ----------
+        sequence : PatternSequence
+            What is projected.
+        index, scan_id : int
+            Number of the pattern, and of the scan.
+        stamp_ns : int
+            Start of the exposure, nanoseconds.
+        exposure_s : float
+            Exposure time, seconds.
+        """
         message = trigger_to_msg(sequence, index, scan_id, stamp_ns, exposure_s, make_message)
         self.write(TRIGGER, stamp_ns, message)
 
@@ -118,7 +130,17 @@ class BagWriter:
         self.write(POSE, stamp_ns, pose_to_msg(StagePose(stamp_ns, position_m), make_message))
 
     def calibration(self, calibration: Calibration, source: str, stamp_ns: int) -> None:
-        """Write the calibration in force; see `rig_to_msg` for the arguments."""
+        """Write the calibration in force; see `rig_to_msg` for the arguments.
+
+        Parameters
+        ----------
+        calibration : Calibration
+            The rig and its evidence.
+        source : str
+            Where it comes from.
+        stamp_ns : int
+            When it came into force, nanoseconds.
+        """
         message = rig_to_msg(calibration, source, stamp_ns, make_message)
         self.write(CALIBRATION, stamp_ns, message)
 

@@ -67,7 +67,15 @@ def typestore() -> Typestore:
 
 
 def make_message(msgtype: str, **fields: Any) -> Any:
-    """Make a message without ROS; see `sl_common.messages.MakeMessage`."""
+    """Make a message without ROS; see `sl_common.messages.MakeMessage`.
+
+    Parameters
+    ----------
+    msgtype : str
+        ``package/msg/Type``.
+    **fields
+        Its fields; those left out have the type's default.
+    """
     return typestore().types[msgtype](**fields)
 
 
@@ -185,7 +193,15 @@ class Bag:
             yield Recorded(raw.topic, raw.received_ns, message)
 
     def raw(self, *topics: Topic, quick: bool = False) -> Iterator[Raw]:
-        """Yield the messages of the given topics as they were on the wire."""
+        """Yield the messages of the given topics as they were on the wire.
+
+        Parameters
+        ----------
+        *topics : Topic
+            All topics when none is named.
+        quick : bool
+            Skip what only a damaged file needs.
+        """
         wanted = {f"{self.namespace}/{topic.name}": topic for topic in topics}
         for file in self._files:
             connections = [c for c in file.storage.connections if c.topic in wanted]

@@ -51,7 +51,15 @@ class RecordedSettings:
         return Settings(saturation_dn=self.full_scale_dn) if self.full_scale_dn else None
 
     def differences(self, settings: Settings, matching: MatcherSettings) -> list[str]:
-        """Say what is chosen otherwise than the recording has it."""
+        """Say what is chosen otherwise than the recording has it.
+
+        Parameters
+        ----------
+        settings : Settings
+            Of the reconstruction.
+        matching : MatcherSettings
+            Of the matching.
+        """
         found = []
         if (recorded := self.of("")) is not None:
             found += _differences(settings.to_dict(), recorded.to_dict())

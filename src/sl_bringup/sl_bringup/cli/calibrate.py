@@ -178,7 +178,15 @@ def _writer(file: Any) -> Callable[[str], None]:
 
 
 def solve_again(source: Path, output: Path | None) -> int:
-    """Solve a stored run, or the calibration in a recording, again; nothing is put in force."""
+    """Solve a stored run, or the calibration in a recording, again; nothing is put in force.
+
+    Parameters
+    ----------
+    source : Path
+        Folder of a run, or a recording.
+    output : Path or None
+        Folder of the result; beside the source if None.
+    """
     from sl_bringup.evaluation.calibrate_bag import solve_recorded
     from sl_calibration.data.run_store import OBSERVATIONS
     from sl_calibration.workflow.conclusion import solve_stored
@@ -198,7 +206,15 @@ def solve_again(source: Path, output: Path | None) -> int:
 
 
 def export(source: Path, file: Path) -> int:
-    """Write a calibration (a file, or a run's) for OpenCV's tools."""
+    """Write a calibration (a file, or a run's) for OpenCV's tools.
+
+    Parameters
+    ----------
+    source : Path
+        Calibration file, or folder of a run.
+    file : Path
+        Written in the form of its suffix.
+    """
     from sl_calibration.data.run_store import CALIBRATION
     from sl_calibration.report.opencv_export import opencv_values, save_opencv
     from sl_reconstruct.model.calibration_file import load_rig

@@ -38,6 +38,13 @@ class Task:
 def tasks_of(bags: Sequence[Path], output: Path) -> list[Task]:
     """Give every bag its folder: the output itself for one, folders in it for several.
 
+    Parameters
+    ----------
+    bags : sequence of Path
+        Recordings.
+    output : Path
+        Folder of the results.
+
     Raises
     ------
     ConfigError
@@ -58,6 +65,15 @@ def evaluate_all(
     tasks: Sequence[Task], choices: Choices, crew: Crew
 ) -> list[tuple[Task, Result | SlError]]:
     """Evaluate bags side by side; one that cannot be evaluated does not stop the others.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+        Bags with their folders.
+    choices : Choices
+        Settings that differ from the recordings'.
+    crew : Crew
+        Processes that do the work.
 
     Returns
     -------

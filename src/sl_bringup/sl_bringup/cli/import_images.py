@@ -74,6 +74,13 @@ def image_files(folder: Path) -> list[Path]:
 def files_of_scan(folder: Path, described: SequenceFile) -> list[Path]:
     """One image file per pattern: those the sequence file names, else all in natural order.
 
+    Parameters
+    ----------
+    folder : Path
+        Folder of the images.
+    described : SequenceFile
+        The sequence, with file names where it has them.
+
     Raises
     ------
     StackError
@@ -99,6 +106,13 @@ def files_of_scan(folder: Path, described: SequenceFile) -> list[Path]:
 
 def read_image(path: Path, notes: Notes) -> NDArray[Any]:
     """Read an image as (H, W) uint8 or uint16; colour becomes grey, and a note says so.
+
+    Parameters
+    ----------
+    path : Path
+        PNG, TIFF, BMP or what else OpenCV reads.
+    notes : Notes
+        Collects what the user should know.
 
     Raises
     ------

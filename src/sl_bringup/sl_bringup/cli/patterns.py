@@ -25,7 +25,15 @@ def dmd_size(text: str) -> tuple[int, int]:
 
 
 def frame_name(index: int, pattern: Pattern) -> str:
-    """File name of a frame; the number comes first, so names sort in order of projection."""
+    """File name of a frame; the number comes first, so names sort in order of projection.
+
+    Parameters
+    ----------
+    index : int
+        Number of the pattern, from 0.
+    pattern : Pattern
+        Gives the rest of the name.
+    """
     if pattern.kind != "gray":
         lit = (pattern.kind == "white") != pattern.inverted
         return f"{index:03d}_{'white' if lit else 'black'}.png"

@@ -280,7 +280,15 @@ class Workshops:
         self._made: OrderedDict[tuple[str, str], Workshop] = OrderedDict()
 
     def of(self, in_force: InForce, settings: Settings) -> Workshop:
-        """Workshop with this calibration in force, and these settings."""
+        """Workshop with this calibration in force, and these settings.
+
+        Parameters
+        ----------
+        in_force : InForce
+            The calibration.
+        settings : Settings
+            Of the reconstruction.
+        """
         with self._lock:
             key = in_force.calibration.hash, settings.hash()
             if key not in self._made:

@@ -175,6 +175,11 @@ def _calibration(file: str) -> Finding:
 def find_usb(vendor: int, product: int) -> list[Any]:
     """Return the USB devices with these ids.
 
+    Parameters
+    ----------
+    vendor, product : int
+        USB ids.
+
     Raises
     ------
     DeviceError

@@ -57,7 +57,15 @@ STAGE_TIMEOUT_S = 2.0
 
 
 def devices(source: Path, running: bool) -> list[Finding]:
-    """Look at all devices that a configuration names; ``running``: its graph has them open."""
+    """Look at all devices that a configuration names; ``running``: its graph has them open.
+
+    Parameters
+    ----------
+    source : Path
+        The configuration file.
+    running : bool
+        Its graph has the devices open.
+    """
     sections = yaml.safe_load(source.read_text()) or {}
 
     def of(node: str) -> dict[str, Any]:
@@ -132,7 +140,15 @@ def _busy(subject: str, text: str, node: Path | None) -> Finding:
 
 
 def projector(parameters: dict[str, Any], running: bool) -> list[Finding]:
-    """The projector's controller: there, permitted, free, of the right kind, and well."""
+    """The projector's controller: there, permitted, free, of the right kind, and well.
+
+    Parameters
+    ----------
+    parameters : dict
+        Section of the node.
+    running : bool
+        The graph has it open.
+    """
     name, device = parameters.get("dmd_model", DEFAULT_MODEL), parameters.get("device", "usb")
     if name not in MODELS:
         text = f"dmd_model {name!r} is unknown; there are {', '.join(sorted(MODELS))}"
@@ -237,7 +253,15 @@ def _projector_state(device: str, name: str, running: bool, node: Path | None) -
 
 
 def stage(parameters: dict[str, Any], running: bool) -> list[Finding]:
-    """The stage's port: there, permitted, free; and what answers on it."""
+    """The stage's port: there, permitted, free; and what answers on it.
+
+    Parameters
+    ----------
+    parameters : dict
+        Section of the node.
+    running : bool
+        The graph has it open.
+    """
     kind, port = parameters.get("kind", "grbl"), parameters.get("port", "")
     if kind == "manual":
         return [Finding("ok", "stage", "moved by hand, confirmed by stage/confirm")]
@@ -305,7 +329,15 @@ def _stage_driver(kind: str, port: str, parameters: dict[str, Any]) -> StageDriv
 
 
 def camera(parameters: dict[str, Any], running: bool) -> list[Finding]:
-    """The camera that the configuration names, and those that answer."""
+    """The camera that the configuration names, and those that answer.
+
+    Parameters
+    ----------
+    parameters : dict
+        Section of the node.
+    running : bool
+        The graph has it open.
+    """
     address = str(parameters.get("address", ""))
     if not address:
         remedy = "put its address into the configuration (docs/cameras.md)"

@@ -72,7 +72,17 @@ class GraphOptions:
 
 
 def client_command(module: str, options: GraphOptions, *arguments: str) -> tuple[str, ...]:
-    """Command of a ROS client of the graph."""
+    """Command of a ROS client of the graph.
+
+    Parameters
+    ----------
+    module : str
+        The client's module.
+    options : GraphOptions
+        Domain and namespace.
+    *arguments : str
+        The client's own.
+    """
     namespace = options.changes.namespace
     return (sys.executable, "-m", module, "--namespace", namespace, *arguments)
 
@@ -83,7 +93,17 @@ def client_environment(options: GraphOptions) -> dict[str, str]:
 
 
 def exec_client(module: str, options: GraphOptions, *arguments: str) -> NoReturn:
-    """Replace this process by a ROS client of the graph, so that signals reach it directly."""
+    """Replace this process by a ROS client of the graph, so that signals reach it directly.
+
+    Parameters
+    ----------
+    module : str
+        The client's module.
+    options : GraphOptions
+        Domain and namespace.
+    *arguments : str
+        The client's own.
+    """
     command = client_command(module, options, *arguments)
     sys.stdout.flush()
     os.execve(command[0], command, client_environment(options))

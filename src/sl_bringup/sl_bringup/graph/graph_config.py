@@ -146,7 +146,17 @@ def write_config(source: Path, directory: Path, changes: Changes) -> Path:
 
 
 def set_parameter(document: dict[str, Any], node: str, name: str, value: object) -> None:
-    """Set one parameter; its section is made when missing."""
+    """Set one parameter; its section is made when missing.
+
+    Parameters
+    ----------
+    document : dict
+        The configuration, changed in place.
+    node, name : str
+        The node's and the parameter's name.
+    value : object
+        What YAML can hold.
+    """
     section = document.setdefault(node, {}).setdefault("ros__parameters", {})
     section[name] = str(value.resolve()) if isinstance(value, Path) else value
 

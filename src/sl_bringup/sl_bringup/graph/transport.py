@@ -127,7 +127,15 @@ class Transport:
 
 
 def profile_xml(segment: int, network: bool) -> str:
-    """Fast DDS profile of a process with so many bytes of shared memory."""
+    """Fast DDS profile of a process with so many bytes of shared memory.
+
+    Parameters
+    ----------
+    segment : int
+        Shared memory, bytes.
+    network : bool
+        Open to other machines; otherwise loopback.
+    """
     return _PROFILE.format(
         segment=segment,
         piece=min(MAX_PIECE_BYTES, segment // 2),
@@ -140,6 +148,13 @@ def segment_bytes(name: str, free: int) -> int:
     """Shared memory of a process, bytes; scaled down to half of what is free, 0 when too little.
 
     Containers have 64 MB by default; pieces of a message wait for each other there.
+
+    Parameters
+    ----------
+    name : str
+        The process, as in the configuration.
+    free : int
+        Free shared memory, bytes.
     """
     wanted = SEGMENT_BYTES.get(name, SMALL_SEGMENT_BYTES)
     whole = sum(SEGMENT_BYTES.values()) + 4 * SMALL_SEGMENT_BYTES
@@ -160,6 +175,13 @@ def clean_stale_segments(directory: Path = SHM_DIRECTORY, min_age_s: float = 10.
 
     As ``fastdds shm clean``: a process that lives holds a lock on its segment's lock file. Files
     younger than ``min_age_s`` are left alone: their owner may be about to lock them.
+
+    Parameters
+    ----------
+    directory : Path
+        Where shared memory lies.
+    min_age_s : float
+        Age from which a file may go, seconds.
     """
     freed = 0
     for lock in directory.glob("fastrtps_" + "[0-9a-z]" * 16 + "_el"):

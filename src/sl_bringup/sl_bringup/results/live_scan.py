@@ -100,7 +100,15 @@ def _measured(points: NDArray[Any] | None, measure: str) -> dict[str, Any]:
 
 
 def check_cloud(points: NDArray[Any], report: Mapping[str, Any]) -> str:
-    """Empty when the cloud is the one that the report is about, else what is wrong."""
+    """Empty when the cloud is the one that the report is about, else what is wrong.
+
+    Parameters
+    ----------
+    points : structured ndarray, (H, W)
+        The cloud as received.
+    report : mapping
+        The scan's report.
+    """
     found = cloud_hash(points)
     if found == report["cloud_hash"]:
         return ""

@@ -38,17 +38,43 @@ SATURATED_COLOUR = "#FF0000"
 
 
 def height_picture(height: HeightMap, title: str) -> bytes:
-    """Height map in colours: axes in millimetres, colour bar in micrometres."""
+    """Height map in colours: axes in millimetres, colour bar in micrometres.
+
+    Parameters
+    ----------
+    height : HeightMap
+        Heights.
+    title : str
+        Heading of the picture.
+    """
     return _map(height, height.z_m, title, "height z", "viridis", symmetric=False)
 
 
 def residual_picture(height: HeightMap, residual_m: NDArray[Any], title: str) -> bytes:
-    """Deviation from a reference, blue below and red above it."""
+    """Deviation from a reference, blue below and red above it.
+
+    Parameters
+    ----------
+    height : HeightMap
+        Gives the axes.
+    residual_m : ndarray, (H, W)
+        Deviation from the reference, metres.
+    title : str
+        Heading of the picture.
+    """
     return _map(height, residual_m, title, "deviation", "RdBu_r", symmetric=True)
 
 
 def relief_picture(height: HeightMap, title: str) -> bytes:
-    """Shaded relief, lit from the upper left, steepened so that the surface shows."""
+    """Shaded relief, lit from the upper left, steepened so that the surface shows.
+
+    Parameters
+    ----------
+    height : HeightMap
+        Heights.
+    title : str
+        Heading of the picture.
+    """
     z = height.z_m.astype(np.float64)
     there = np.isfinite(z)
     slopes = np.hypot(*np.gradient(z, height.step_m)) if min(z.shape) > 1 else np.zeros(1)
@@ -106,7 +132,15 @@ def profile_picture(points: NDArray[Any], title: str) -> bytes:
 
 
 def section_picture(sections: Sequence[tuple[str, ProfileMeasurement]], title: str) -> bytes:
-    """Sections over each other, each with a band of two standard uncertainties."""
+    """Sections over each other, each with a band of two standard uncertainties.
+
+    Parameters
+    ----------
+    sections : sequence of (str, ProfileMeasurement)
+        Name and section.
+    title : str
+        Heading of the picture.
+    """
     figure = Figure(figsize=(11, 2.6 * len(sections)), layout="constrained")
     axes = figure.subplots(len(sections), 1, sharex=True, squeeze=False)[:, 0]
     figure.suptitle(title)
@@ -258,7 +292,15 @@ def _fullest_middle_row(points: NDArray[Any]) -> int:
 
 
 def broken_at_gaps(x: NDArray[Any], *values: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """Put a NaN wherever the points are far apart, so that no line bridges a gap."""
+    """Put a NaN wherever the points are far apart, so that no line bridges a gap.
+
+    Parameters
+    ----------
+    x : ndarray, (N,)
+        Ascending coordinate.
+    *values : ndarray, (N,)
+        What is drawn over it.
+    """
     apart = np.diff(x)
     if not apart.size:
         return (x, *values)

@@ -230,12 +230,27 @@ def _triangle(
 
 
 def save_tiff(path: str | Path, height: HeightMap) -> None:
-    """Write a height map as 32-bit float TIFF: metres, NaN where nothing was measured."""
+    """Write a height map as 32-bit float TIFF: metres, NaN where nothing was measured.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    height : HeightMap
+        Written as it is, z up.
+    """
     _write(Path(path), height.z_m)
 
 
 def save_png(path: str | Path, height: HeightMap) -> tuple[float, float]:
     """Write a height map as 16-bit grey PNG: 0 is missing, 1 to 65535 from lowest to highest.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    height : HeightMap
+        Scaled to its own range.
 
     Returns
     -------

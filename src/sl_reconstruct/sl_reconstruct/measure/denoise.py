@@ -313,6 +313,11 @@ def choose(heights: Array, noise: Array) -> Estimate:
     """Waves or windows, whichever is nearer to the surface of these heights.
 
     By Stein's unbiased estimate of the squared error (Annals of Statistics 9, 1981).
+
+    Parameters
+    ----------
+    heights, noise : ndarray, (H, W)
+        Heights and their standard deviations, metres.
     """
     variance = np.mean(noise**2, axis=0)
     variance = np.maximum(variance, LEAST_VARIANCE * variance.mean())

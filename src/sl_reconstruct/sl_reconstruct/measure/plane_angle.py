@@ -125,6 +125,11 @@ def measure_plane(chosen: Selection, flatness: bool = True) -> PlaneMeasurement:
 def measure_angle(first: Selection, second: Selection) -> AngleMeasurement:
     """Included angle of the planes through two sets of points, as in the paper's Table 2.
 
+    Parameters
+    ----------
+    first, second : Selection
+        Points of one plane each; three or more.
+
     Raises
     ------
     StackError

@@ -157,7 +157,15 @@ def _variance(
 
 
 def save_profile(path: str | Path, profile: ProfileMeasurement) -> None:
-    """Write a section as CSV: distance, height and its standard uncertainty, metres."""
+    """Write a section as CSV: distance, height and its standard uncertainty, metres.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    profile : ProfileMeasurement
+        Bins without points are written as NaN.
+    """
     columns = np.column_stack([profile.along_m, profile.z_m, profile.u_z_m])
     with written_atomically(Path(path)) as partial:
         np.savetxt(partial, columns, fmt="%.9e", delimiter=",",

@@ -37,7 +37,13 @@ class Region:
 
     @classmethod
     def rectangle(cls, x0_m: float, y0_m: float, x1_m: float, y1_m: float) -> Region:
-        """Rectangle between two opposite corners."""
+        """Rectangle between two opposite corners.
+
+        Parameters
+        ----------
+        x0_m, y0_m, x1_m, y1_m : float
+            Corners, metres, in any order.
+        """
         return cls(((x0_m, y0_m), (x1_m, y0_m), (x1_m, y1_m), (x0_m, y1_m)))
 
     @classmethod
@@ -71,7 +77,13 @@ class Region:
         return float(left), float(bottom), float(right), float(top)
 
     def contains(self, x_m: NDArray[Any], y_m: NDArray[Any]) -> NDArray[np.bool_]:
-        """Whether points lie inside, same shape as x and y; NaN does not (even-odd rule)."""
+        """Whether points lie inside, same shape as x and y; NaN does not (even-odd rule).
+
+        Parameters
+        ----------
+        x_m, y_m : ndarray
+            Coordinates, metres, of one shape.
+        """
         left, bottom, right, top = self.bounds_m
         inside = (x_m >= left) & (x_m <= right) & (y_m >= bottom) & (y_m <= top)
         if self == Region.rectangle(left, bottom, right, top):

@@ -93,6 +93,13 @@ class Answer:
 def carry_out(order: MeasurementRequest, points: Points) -> Answer:
     """Measure a cloud.
 
+    Parameters
+    ----------
+    order : MeasurementRequest
+        Kind, regions, reference and tolerance.
+    points : Points
+        Cloud or height map, metres.
+
     Raises
     ------
     ConfigError

@@ -65,6 +65,11 @@ class Quantity(NamedTuple):
 def rounded(value: float, u: float) -> str:
     """Value and uncertainty, the latter with two digits, the former to the same place.
 
+    Parameters
+    ----------
+    value, u : float
+        In one unit; u may be NaN.
+
     Examples
     --------
     >>> rounded(155.920213, 0.000123), rounded(12.5, float("nan"))
@@ -161,6 +166,11 @@ class Tolerance:
 
     def verdict(self, value: float, uncertainty: float) -> Verdict:
         """Decide by ISO 14253-1:2017: conformance needs 95 % probability, so does its opposite.
+
+        Parameters
+        ----------
+        value, uncertainty : float
+            Measured value and its standard uncertainty, in the tolerance's unit.
 
         Examples
         --------

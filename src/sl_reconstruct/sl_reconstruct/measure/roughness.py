@@ -147,6 +147,13 @@ def areal_parameters(z_m: NDArray[Any], step_m: float) -> dict[str, float]:
 def crop(points: NDArray[Any], region: Region | None) -> NDArray[Any]:
     """Smallest rows and columns of an organised cloud that hold a region; NaN outside it.
 
+    Parameters
+    ----------
+    points : structured ndarray, (H, W)
+        An organised cloud.
+    region : Region or None
+        None for all of it.
+
     Raises
     ------
     StackError

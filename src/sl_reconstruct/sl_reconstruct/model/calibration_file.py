@@ -108,7 +108,15 @@ def load_rig(
     camera_size: tuple[int, int] | None = None,
     projector_size: tuple[int, int] | None = None,
 ) -> Rig:
-    """Return the rig in a calibration file; see `load_calibration`."""
+    """Return the rig in a calibration file; see `load_calibration`.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    camera_size, projector_size : tuple of int, optional
+        Width and height, pixels, for files that lack them.
+    """
     return load_calibration(path, camera_size, projector_size).rig
 
 
@@ -142,7 +150,13 @@ def load_calibration(
 
 
 def parse_calibration(text: str, source: str = "calibration") -> Calibration:
-    """Read a calibration from YAML text (format 1); errors as in `load_calibration`."""
+    """Read a calibration from YAML text (format 1); errors as in `load_calibration`.
+
+    Parameters
+    ----------
+    text, source : str
+        The document; what it is, for messages.
+    """
     document = parse_document(text, source, CalibrationError)
     fields = Fields(document, source, CalibrationError, _TOP_KEYS)
     version = fields.get("format", a_whole_number)
@@ -169,7 +183,17 @@ def _check_hash(stored: str | None, rig: Rig, source: str) -> None:
 
 
 def a_device(value: Any, where: str, error: type[SlError]) -> Device:
-    """Check that a value is a device's section, and return the device."""
+    """Check that a value is a device's section, and return the device.
+
+    Parameters
+    ----------
+    value : object
+        What the document has.
+    where : str
+        Its place, for messages.
+    error : type
+        What is raised.
+    """
     fields = Fields(value, where, error, _DEVICE_KEYS)
     model = fields.get("model", a_string)
     if model not in ("division", "brown_conrady"):
@@ -211,7 +235,17 @@ def _focal_length(value: Any, where: str, error: type[SlError]) -> tuple[float, 
 
 
 def a_rotation(value: Any, where: str, error: type[SlError]) -> Array:
-    """Check that a value is a 3 x 3 rotation, row by row; see `nearest_rotation`."""
+    """Check that a value is a 3 x 3 rotation, row by row; see `nearest_rotation`.
+
+    Parameters
+    ----------
+    value : object
+        What the document has.
+    where : str
+        Its place, for messages.
+    error : type
+        What is raised.
+    """
     rows = a_list(value, where, error)
     if len(rows) != 3:
         raise error(f"{where} has {len(rows)} rows; expected 3")
@@ -220,7 +254,17 @@ def a_rotation(value: Any, where: str, error: type[SlError]) -> Array:
 
 
 def a_covariance(value: Any, where: str, error: type[SlError]) -> Covariance:
-    """Check that a value is a covariance with as many rows as names."""
+    """Check that a value is a covariance with as many rows as names.
+
+    Parameters
+    ----------
+    value : object
+        What the document has.
+    where : str
+        Its place, for messages.
+    error : type
+        What is raised.
+    """
     fields = Fields(value, where, error, ("parameters", "matrix"))
     names = [a_string(name, where, error) for name in fields.get("parameters", a_list)]
     rows = fields.get("matrix", a_list)
@@ -293,6 +337,13 @@ def dump_calibration(calibration: Calibration | Rig) -> str:
 
 def save_calibration(path: str | Path, calibration: Calibration | Rig) -> None:
     """Write a calibration file in one step; a rig that no file may hold is refused.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    calibration : Calibration or Rig
+        A rig alone is written without evidence.
 
     Raises
     ------

@@ -27,11 +27,27 @@ class Lens(Protocol):
     """What lies between the ideal and the observed image point."""
 
     def undistort(self, q_px: Array, focal_px: Array, centre_px: Array) -> Array:
-        """Ideal image points of observed ones, both (..., 2) in pixels."""
+        """Ideal image points of observed ones, both (..., 2) in pixels.
+
+        Parameters
+        ----------
+        q_px : ndarray, (..., 2)
+            Observed image points, pixels.
+        focal_px, centre_px : ndarray, (2,)
+            Focal lengths and image centre, pixels.
+        """
         ...
 
     def distort(self, q_px: Array, focal_px: Array, centre_px: Array) -> Array:
-        """Observed image points of ideal ones, both (..., 2) in pixels."""
+        """Observed image points of ideal ones, both (..., 2) in pixels.
+
+        Parameters
+        ----------
+        q_px : ndarray, (..., 2)
+            Ideal image points, pixels.
+        focal_px, centre_px : ndarray, (2,)
+            Focal lengths and image centre, pixels.
+        """
         ...
 
 
@@ -48,13 +64,13 @@ class Division:
     kappa: float = 0.0
 
     def undistort(self, q_px: Array, focal_px: Array, centre_px: Array) -> Array:
-        """Ideal image points, closed form."""
+        """See `Lens`; closed form."""
         offset = q_px - centre_px
         r2 = np.sum(offset**2, axis=-1, keepdims=True)
         return np.asarray(centre_px + offset * (1.0 + self.kappa * r2))
 
     def distort(self, q_px: Array, focal_px: Array, centre_px: Array) -> Array:
-        """Observed image points: the root of ``r_u = r_d (1 + kappa r_d^2)`` by Newton from r_u.
+        """See `Lens`: the root of ``r_u = r_d (1 + kappa r_d^2)`` by Newton from r_u.
 
         NaN where there is none (kappa < 0 and r_u beyond the fold of the model).
         """
@@ -83,7 +99,7 @@ class BrownConrady:
     coefficients: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
     def undistort(self, q_px: Array, focal_px: Array, centre_px: Array) -> Array:
-        """Ideal image points, by OpenCV's iteration carried to 1e-12."""
+        """See `Lens`; by OpenCV's iteration carried to 1e-12."""
         flat = np.ascontiguousarray(q_px, dtype=np.float64).reshape(-1, 1, 2)
         matrix = _camera_matrix(focal_px, centre_px)
         stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-12)
@@ -93,7 +109,7 @@ class BrownConrady:
         return np.asarray(out, dtype=np.float64).reshape(q_px.shape)
 
     def distort(self, q_px: Array, focal_px: Array, centre_px: Array) -> Array:
-        """Observed image points, closed form."""
+        """See `Lens`; closed form."""
         k1, k2, p1, p2, k3 = self.coefficients
         x, y = np.moveaxis((q_px - centre_px) / focal_px, -1, 0)
         r2 = x * x + y * y

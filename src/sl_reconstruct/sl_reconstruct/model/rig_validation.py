@@ -36,6 +36,15 @@ def nearest_rotation(matrix: Array, where: str, error: type[SlError] = Calibrati
 
     What is orthonormal as `Device` demands is returned untouched, so that files keep their bits;
     up to `TYPED_ROTATION_TOLERANCE` the nearest rotation (polar decomposition) is returned.
+
+    Parameters
+    ----------
+    matrix : ndarray, (3, 3)
+        As written, perhaps rounded.
+    where : str
+        Its place, for messages.
+    error : type
+        What is raised when it is no rotation.
     """
     deviation = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     if deviation <= ORTHONORMAL_TOLERANCE and np.linalg.det(matrix) > 0:
@@ -51,6 +60,13 @@ def nearest_rotation(matrix: Array, where: str, error: type[SlError] = Calibrati
 
 def check_rig(rig: Rig, source: str) -> None:
     """Refuse a rig whose numbers cannot belong to a real one.
+
+    Parameters
+    ----------
+    rig : Rig
+        Camera and projector.
+    source : str
+        Where it comes from, for the message.
 
     Raises
     ------
