@@ -42,7 +42,7 @@ class Endpoint(ABC):
         """Drop the host and serve no more."""
         self._stop.set()
         self._drop_host()
-        if self._thread.is_alive():
+        if self._thread.ident is not None:  # started
             self._thread.join()
             self._shut()
 
