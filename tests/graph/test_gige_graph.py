@@ -139,7 +139,7 @@ def test_a_whole_scan_through_gige_vision_and_its_trigger_line(tmp_path: Path) -
             for i in (0, 10):
                 expected = world.expose([(PAPER.frame(i), EXPOSURE_S)], EXPOSURE_S, i + 1)
                 # Not bit by bit: nanoseconds of the exposure may tip a pixel over.
-                assert np.mean(stack.data[i] != expected) < 1e-4
+                assert np.mean(stack.images[i] != expected) < 1e-4
             assert camera.packets()["resent_packets"] > 0
 
             bench.execute({"fault": {"camera": {"at": {"drop": [4]}}}})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,9 @@ from sl_interfaces.action import Calibrate
 from sl_interfaces.srv import Verify
 
 from sl_bringup.cli.calibrate import outcome_lines
-from sl_bringup.client_node import GraphClient, run_client
+from sl_bringup.cli.main import parse
+from sl_bringup.cli.up import graph_options
+from sl_bringup.client_node import CONNECT_S, GraphClient, run_client
 from sl_bringup.graph.console import say
 from sl_bringup.results.paper_tables import table_1_lines
 from sl_common import topics
@@ -32,23 +35,23 @@ class CalibrateClient(GraphClient):
         self._action = self.action_client(topics.CALIBRATE_ACTION)
         self._verify = self.client(topics.VERIFY)
 
-    def calibrate(self, goal: Calibrate.Goal, connect_s: float, patience_s: float) -> Any:
+    def calibrate(self, goal: Calibrate.Goal, patience_s: float) -> Any:
         """Calibrate, and return the action's result; cancelled as by `carry_out`.
 
         Raises
         ------
         DeviceLost
-            When no node offers it within ``connect_s``, or it is refused.
+            When no node offers it in time, or it is refused.
         DeviceTimeout
             When the graph does not answer in time.
         """
-        self.await_graph(self._action.server_is_ready, topics.CALIBRATE, connect_s)
+        self.await_graph(self._action.server_is_ready, topics.CALIBRATE, CONNECT_S)
         return self.carry_out(self._action, goal, self._feedback, patience_s)
 
-    def verify(self, request: Verify.Request, connect_s: float, patience_s: float) -> Any:
+    def verify(self, request: Verify.Request, patience_s: float) -> Any:
         """Check the calibration in force, and return the service's answer; errors as above."""
         # A request to a service that is not found yet would be lost.
-        self.await_graph(self._verify.service_is_ready, topics.VERIFY, connect_s)
+        self.await_graph(self._verify.service_is_ready, topics.VERIFY, CONNECT_S)
         return self.answer(self._verify.call_async(request), patience_s)
 
     def _feedback(self, message: Any) -> None:
@@ -57,30 +60,24 @@ class CalibrateClient(GraphClient):
         self.show(line, f" {told.progress:4.0%}")
 
 
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--namespace", default="/sl")
-    parser.add_argument("--target", default="both")
-    parser.add_argument("--heights-m", type=float, nargs="+", default=[])
-    parser.add_argument("--sequence", default="")
-    parser.add_argument("--keep", default="")
-    parser.add_argument("--verify", default="")
-    parser.add_argument("--timeout", type=float, default=600.0)
-    parser.add_argument("--connect-timeout", type=float, default=10.0)
-    return parser.parse_args(argv)
-
-
 def _calibrate(client: CalibrateClient, args: argparse.Namespace) -> int:
     goal = Calibrate.Goal(
-        target=args.target, heights_m=args.heights_m, sequence=args.sequence, keep=args.keep
+        target=args.target,
+        heights_m=_heights_m(args),
+        sequence=args.sequence,
+        keep=str(args.keep.resolve()) if args.keep else "",
     )
-    result = client.calibrate(goal, args.connect_timeout, args.timeout)
+    result = client.calibrate(goal, args.timeout)
     client.end_line()
     for line in outcome_lines(result):
         say(line)
     for line in _table_1(result.report):
         say(line)
     return 0 if result.success else 1
+
+
+def _heights_m(args: argparse.Namespace) -> list[float]:
+    return [height_mm * 1e-3 for height_mm in args.heights_mm]
 
 
 def _table_1(report: str) -> list[str]:
@@ -92,8 +89,8 @@ def _table_1(report: str) -> list[str]:
 
 
 def _verify(client: CalibrateClient, args: argparse.Namespace) -> int:
-    request = Verify.Request(target=args.verify, heights_m=args.heights_m)
-    answer = client.verify(request, args.connect_timeout, args.timeout)
+    request = Verify.Request(target=args.verify, heights_m=_heights_m(args))
+    answer = client.verify(request, args.timeout)
     say(answer.message)
     if answer.report:
         say(f"report            {answer.report}")
@@ -102,10 +99,10 @@ def _verify(client: CalibrateClient, args: argparse.Namespace) -> int:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Calibrate once; exit status 0 only when the calibration is in force."""
-    args = _arguments(argv)
+    args = parse(["calibrate", *(sys.argv[1:] if argv is None else argv)])
 
     def work() -> int:
-        client = CalibrateClient(args.namespace)
+        client = CalibrateClient(graph_options(args).changes.namespace)
         return (_verify if args.verify else _calibrate)(client, args)
 
     return run_client("slrig calibrate", work)

@@ -11,12 +11,13 @@ from typing import Any
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from sl_bringup.graph.console import complain
+from sl_bringup.graph.console import INTERRUPTED, complain
 from sl_common.base_node import GraphNode
 from sl_common.errors import DeviceLost, DeviceTimeout, SlError
 from sl_common.topics import Service
 
-INTERRUPTED = 130
+#: A graph that runs is found within this.
+CONNECT_S = 10.0
 #: A cancelled goal ends when stage and projector have stopped.
 CANCEL_S = 20.0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import signal
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,10 +20,13 @@ from rclpy.signals import SignalHandlerOptions
 
 from sl_bringup.bag.bag_recorder import BagRecorder
 from sl_bringup.bag.bag_writer import topic_qos
+from sl_bringup.cli.main import parse
+from sl_bringup.cli.record import size_bytes
 from sl_bringup.graph.console import StatusLine, complain, say
 from sl_bringup.graph.version import software_version
-from sl_common.base_node import GraphNode, interface_class, qos_profile
+from sl_common.base_node import GraphNode, qos_profile
 from sl_common.errors import BagError, SlError
+from sl_common.messages import interface_class
 from sl_common.topics import (
     EVALUATED_TOPICS,
     IMAGE,
@@ -203,22 +207,12 @@ def _outcome(node: RecordNode, path: Path) -> Iterator[str]:
         yield f"{path} has no image"
 
 
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--namespace", default="/sl")
-    parser.add_argument("--output", type=Path, required=True)
-    parser.add_argument("--split", type=int, default=0, help="bytes")
-    parser.add_argument("--all", action="store_true")
-    parser.add_argument("--compress", action="store_true")
-    return parser.parse_args(argv)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Record until SIGINT or SIGTERM; exit status 0 when nothing was lost."""
-    args = _arguments(argv)
+    args = parse(["record", *(sys.argv[1:] if argv is None else argv)])
     custom = {"software": software_version(), "namespace": args.namespace}
     try:
-        with BagRecorder(args.output, custom, args.split, args.compress) as bag:
+        with BagRecorder(args.output, custom, size_bytes(args.split), args.compress) as bag:
             return _record(args, bag)
     except (SlError, OSError) as error:
         complain(f"slrig record: {error}")

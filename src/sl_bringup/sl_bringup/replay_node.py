@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import rclpy
 from rclpy.duration import Duration
@@ -13,6 +13,7 @@ from rclpy.executors import ExternalShutdownException
 from rosgraph_msgs.msg import Clock
 
 from sl_bringup.bag.bags import Bag, Raw, open_bag
+from sl_bringup.cli.main import parse
 from sl_bringup.graph.console import StatusLine, complain, say
 from sl_common.base_node import GraphNode
 from sl_common.errors import BagError, SlError
@@ -94,19 +95,9 @@ class ReplayNode(GraphNode):
         self._clock_topic.publish(Clock(clock=stamp_to_msg(now_ns)))
 
 
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("bag", type=Path)
-    parser.add_argument("--namespace", default="/sl")
-    parser.add_argument("--rate", type=float, default=1.0)
-    parser.add_argument("--wait", type=float, default=10.0)
-    parser.add_argument("--all", action="store_true")
-    return parser.parse_args(argv)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Play a bag; exit status 0 when all of it was there and reached its listeners."""
-    args = _arguments(argv)
+    args = parse(["replay", *(sys.argv[1:] if argv is None else argv)])
     try:
         with open_bag(args.bag) as bag:
             return _play(args, bag)

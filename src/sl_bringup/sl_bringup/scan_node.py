@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import sys
 import threading
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,11 @@ from sensor_msgs.msg import Image, PointCloud2
 from sl_interfaces.action import Scan
 from sl_interfaces.msg import ScanReport
 
-from sl_bringup.client_node import GraphClient, run_client
+from sl_bringup.cli.main import parse
+from sl_bringup.cli.up import graph_options
+from sl_bringup.client_node import CONNECT_S, GraphClient, run_client
 from sl_bringup.graph.console import complain, say
-from sl_bringup.results.live_scan import MEASURES, check_cloud, live_report, summary, write_result
+from sl_bringup.results.live_scan import check_cloud, live_report, summary, write_result
 from sl_common import topics
 from sl_reconstruct.messages import cloud_from_msg, refusals_from_msg
 
@@ -118,20 +120,6 @@ def _deliver(
     return 0 if result.success and not fault else 1
 
 
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--namespace", default="/sl")
-    parser.add_argument("--output", type=Path, required=True)
-    parser.add_argument("--sequence", default="")
-    parser.add_argument("--exposure", type=float, default=0.0)
-    parser.add_argument("--repeats", type=int, default=DEFAULT_REPEATS)
-    parser.add_argument("--timeout", type=float, default=120.0)
-    parser.add_argument("--measure", choices=("", *MEASURES), default="")
-    parser.add_argument("--no-pictures", action="store_true")
-    parser.add_argument("--connect-timeout", type=float, default=10.0)
-    return parser.parse_args(argv)
-
-
 def _import_meanwhile(module: str) -> None:
     """Import what takes a second and is needed only when the cloud is there."""
     threading.Thread(target=importlib.import_module, args=(module,), name=module).start()
@@ -139,14 +127,15 @@ def _import_meanwhile(module: str) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Scan once; exit status 0 only when the cloud is there."""
-    args = _arguments(argv)
+    args = parse(["scan", *(sys.argv[1:] if argv is None else argv)])
 
     def work() -> int:
-        client = ScanClient(args.namespace)
-        client.connect(args.connect_timeout)
+        client = ScanClient(graph_options(args).changes.namespace)
+        client.connect(CONNECT_S)
         if not args.no_pictures:
             _import_meanwhile("sl_bringup.results.scan_pictures")
-        goal = Scan.Goal(sequence=args.sequence, exposure_s=args.exposure, max_repeats=args.repeats)
+        repeats = DEFAULT_REPEATS if args.repeats is None else args.repeats
+        goal = Scan.Goal(sequence=args.sequence, exposure_s=args.exposure, max_repeats=repeats)
         result, cloud = client.scan(goal, args.timeout)
         client.end_line()
         return _deliver(args, result, cloud, client.refusals())

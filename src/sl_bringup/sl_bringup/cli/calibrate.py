@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import asyncio
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sl_bringup.cli.up import add_graph_arguments, graph_options, until_signal
+from sl_bringup.cli.up import add_graph_arguments, graph_options, run_once
+from sl_bringup.graph.client_process import become_client
 from sl_bringup.graph.console import complain, say
-from sl_bringup.graph.graph import Graph, GraphOptions, exec_client, is_running
+from sl_bringup.graph.graph import Graph, GraphOptions, client_command, is_running
 from sl_common.documents import read_document
 from sl_common.errors import ConfigError
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from sl_calibration.workflow.conclusion import Outcome
 
 CLIENT = "sl_bringup.calibrate_node"
-INTERRUPTED = 130
 
 
 def add_parser(subparsers: Any) -> None:
@@ -85,38 +85,18 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run)
 
 
-def client_arguments(args: argparse.Namespace) -> list[str]:
-    """Arguments of the ROS client."""
-    words = ["--target", args.target, "--timeout", f"{args.timeout}"]
-    if args.sequence:
-        words += ["--sequence", args.sequence]
-    if args.heights_mm:
-        words += ["--heights-m", *(f"{height * 1e-3}" for height in args.heights_mm)]
-    if args.keep:
-        words += ["--keep", str(args.keep.resolve())]
-    return [*words, "--verify", args.verify] if args.verify else words
-
-
-async def calibrate_once(
-    options: GraphOptions,
-    client: Sequence[str],
-    ready_timeout_s: float,
-    tell: Callable[[str], None],
-) -> int:
+async def calibrate_once(args: argparse.Namespace, options: GraphOptions) -> int:
     """Start a graph, calibrate, stop the graph; 0 only when all went well."""
+    log = options.directory / "graph.log"
+    with log.open("w") as file:
 
-    async def work(graph: Graph) -> int:
-        if not await graph.ready(ready_timeout_s):
-            return 1
-        return await graph.run_client(CLIENT, *client)
+        async def work(graph: Graph) -> int:
+            if not await graph.ready(args.ready_timeout):
+                return 1
+            return await graph.run_client(client_command(CLIENT, *args.words))
 
-    async with Graph(options, tell) as graph:
-        status = await until_signal(work(graph))
-    if status is None:
-        return INTERRUPTED
-    for reason in graph.supervisor.unclean:
-        complain(f"slrig calibrate: at the end, {reason}")
-    return status or int(bool(graph.supervisor.unclean))
+        say(f"starting the graph{' on the bench' if options.bench else ''} (log: {log})")
+        return await run_once(options, lambda line: file.write(line + "\n"), work, "calibrate")
 
 
 async def calibrate_bench(graph: Graph, options: GraphOptions) -> int:
@@ -134,7 +114,8 @@ async def calibrate_bench(graph: Graph, options: GraphOptions) -> int:
 
     say("calibrating: the hole plate is on the stage")
     await asyncio.to_thread(put, "hole_plate", "matt", _plate_on_bench(config, options))
-    status = await graph.run_client(CLIENT)
+    words = ("--ros-args", *options.changes.ros_args)
+    status = await graph.run_client(client_command(CLIENT, *words))
     await asyncio.to_thread(put, part.surface, part.finish, part.surface_parameters)
     say(f"the {part.surface} is on the stage again")
     return status
@@ -160,21 +141,9 @@ def run(args: argparse.Namespace) -> int:
     if args.opencv:
         raise ConfigError("--opencv writes a run's calibration; expected --from RUN beside it")
     options = graph_options(args)
-    client = client_arguments(args)
     if args.up and not is_running(options.directory):
-        log = options.directory / "graph.log"
-        say(f"starting the graph{' on the bench' if options.bench else ''} (log: {log})")
-        with log.open("w") as file:
-            tell = _writer(file)
-            return asyncio.run(calibrate_once(options, client, args.ready_timeout, tell))
-    return exec_client(CLIENT, options, *client)
-
-
-def _writer(file: Any) -> Callable[[str], None]:
-    def tell(line: str) -> None:
-        file.write(line + "\n")
-
-    return tell
+        return asyncio.run(calibrate_once(args, options))
+    return become_client(CLIENT, args.words, options.transport)
 
 
 def solve_again(source: Path, output: Path | None) -> int:

@@ -59,6 +59,19 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
     return parser
 
 
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """Parse a command line, ``COMMAND [OPTION ...]``.
+
+    A command that is a ROS client replaces its process by the client, which parses the same words:
+    they are in ``words``, without the command.
+    """
+    known = {name for name, _, _ in COMMANDS}
+    command = next((word for word in arguments if word in known), None)
+    args = build_parser(command).parse_args(arguments)
+    args.words = tuple(arguments[1:])
+    return args
+
+
 def _add_placeholder(subparsers: Any, name: str) -> None:
     subparsers.add_parser(name, add_help=False)
 
@@ -68,11 +81,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     An error of ours is one line on standard error and status 1; wrong usage is status 2.
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    known = {name for name, _, _ in COMMANDS}
-    command = next((word for word in arguments if word in known), None)
     try:
-        args = build_parser(command).parse_args(arguments)
+        args = parse(sys.argv[1:] if argv is None else argv)
         return int(args.run(args))
     except SlError as exc:
         complain(f"slrig: error: {exc}")

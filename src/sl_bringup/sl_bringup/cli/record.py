@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from sl_bringup.graph.client_process import add_client_arguments, become_client
+from sl_bringup.graph.client_process import add_client_arguments, become_client, transport_of
 from sl_common.errors import ConfigError
 
 CLIENT = "sl_bringup.record_node"
@@ -67,9 +67,6 @@ def size_bytes(words: str) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Carry out ``slrig record``; the recorder takes this process's place."""
-    split = size_bytes(args.split)
-    if 0 < split < LEAST_SPLIT:
+    if 0 < (split := size_bytes(args.split)) < LEAST_SPLIT:
         raise ConfigError(f"--split {args.split} is {split} bytes; expected 1MB at least, or 0")
-    words = ["--output", str(args.output), "--split", str(split)]
-    words += [f"--{name}" for name in ("all", "compress") if getattr(args, name)]
-    return become_client(CLIENT, args, words)
+    return become_client(CLIENT, args.words, transport_of(args))

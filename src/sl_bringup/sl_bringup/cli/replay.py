@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from sl_bringup.graph.client_process import add_client_arguments, become_client
+from sl_bringup.graph.client_process import add_client_arguments, become_client, transport_of
 from sl_common.errors import ConfigError
 
 CLIENT = "sl_bringup.replay_node"
@@ -49,5 +49,4 @@ def run(args: argparse.Namespace) -> int:
     """Carry out ``slrig replay``; the player takes this process's place."""
     if not 0.01 <= args.rate <= 1000:
         raise ConfigError(f"--rate {args.rate:g}; expected 0.01 to 1000")
-    words = [str(args.bag), "--rate", f"{args.rate}", "--wait", f"{args.wait}"]
-    return become_client(CLIENT, args, [*words, "--all"] if args.all else words, "camera")
+    return become_client(CLIENT, args.words, transport_of(args), "camera")

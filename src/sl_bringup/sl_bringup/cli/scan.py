@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from sl_bringup.cli.calibrate import calibrate_bench
-from sl_bringup.cli.up import add_graph_arguments, graph_options, until_signal
-from sl_bringup.graph.console import complain, say
-from sl_bringup.graph.graph import Graph, GraphOptions, exec_client, is_running
+from sl_bringup.cli.up import add_graph_arguments, graph_options, run_once
+from sl_bringup.graph.client_process import become_client
+from sl_bringup.graph.console import say
+from sl_bringup.graph.graph import Graph, GraphOptions, client_command, is_running
 from sl_common.errors import ConfigError
 
 CLIENT = "sl_bringup.scan_node"
-INTERRUPTED = 130
 
 
 def add_parser(subparsers: Any) -> None:
@@ -64,51 +63,31 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run)
 
 
-def client_arguments(args: argparse.Namespace) -> list[str]:
-    """Arguments of the ROS client."""
-    words = ["--output", str(args.output), "--timeout", f"{args.timeout}"]
-    words += ["--exposure", f"{args.exposure}"]
-    for name in ("sequence", "measure"):
-        if value := getattr(args, name):
-            words += [f"--{name}", value]
-    if args.repeats is not None:
-        words += ["--repeats", f"{args.repeats}"]
-    return [*words, "--no-pictures"] if args.no_pictures else words
-
-
-async def scan_once(
-    options: GraphOptions, client: Sequence[str], ready_timeout_s: float, log: Path, verbose: bool
-) -> int:
+async def scan_once(args: argparse.Namespace, options: GraphOptions) -> int:
     """Start a graph, calibrate where it is to, scan, stop it; 0 only when all went well."""
+    log: Path = args.output / "graph.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("w") as file:
 
         def tell(line: str) -> None:
             file.write(line + "\n")
-            if verbose:
+            if args.verbose:
                 say(line)
 
         async def work(graph: Graph) -> int:
-            if not await graph.ready(ready_timeout_s):
+            if not await graph.ready(args.ready_timeout):
                 return 1
             if options.changes.uncalibrated and (status := await calibrate_bench(graph, options)):
                 return status
-            return await graph.run_client(CLIENT, *client)
+            return await graph.run_client(client_command(CLIENT, *args.words))
 
         say(f"starting the graph{' on the bench' if options.bench else ''} (log: {log})")
-        async with Graph(options, tell) as graph:
-            status = await until_signal(work(graph))
-    if status is None:
-        return INTERRUPTED
-    for reason in graph.supervisor.unclean:
-        complain(f"slrig scan: at the end, {reason}")
-    return status or int(bool(graph.supervisor.unclean))
+        return await run_once(options, tell, work, "scan")
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry out ``slrig scan``."""
     options = graph_options(args)
-    client = client_arguments(args)
     if args.calibrate:
         if not (args.up and args.bench) or is_running(options.directory):
             raise ConfigError(
@@ -117,6 +96,5 @@ def run(args: argparse.Namespace) -> int:
             )
         options = replace(options, changes=replace(options.changes, uncalibrated=True))
     if args.up and not is_running(options.directory):
-        log = args.output / "graph.log"
-        return asyncio.run(scan_once(options, client, args.ready_timeout, log, args.verbose))
-    return exec_client(CLIENT, options, *client)
+        return asyncio.run(scan_once(args, options))
+    return become_client(CLIENT, args.words, options.transport)

@@ -6,12 +6,12 @@ import argparse
 import asyncio
 import os
 import signal
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sl_bringup.graph.console import complain, say
+from sl_bringup.graph.console import INTERRUPTED, complain, say
 from sl_bringup.graph.graph import Graph, GraphOptions
 from sl_bringup.graph.graph_config import Changes
 from sl_common.errors import ConfigError
@@ -72,6 +72,39 @@ async def until_signal(work: Awaitable[_ResultT]) -> _ResultT | None:
         # From here on the stop is under way; another Ctrl-C must not leave processes behind.
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, lambda: None)
+
+
+async def run_once(
+    options: GraphOptions,
+    tell: Callable[[str], object],
+    work: Callable[[Graph], Awaitable[int]],
+    command: str,
+) -> int:
+    """Start a graph, do something with it, stop it.
+
+    Parameters
+    ----------
+    options : GraphOptions
+        What it is started with.
+    tell : callable
+        Gets every line of its processes.
+    work : callable
+        Returns an exit status.
+    command : str
+        For which the user started it, for complaints.
+
+    Returns
+    -------
+    int
+        Exit status: 0 when the work went well and everything ended cleanly, 130 after a signal.
+    """
+    async with Graph(options, tell) as graph:
+        status = await until_signal(work(graph))
+    if status is None:
+        return INTERRUPTED
+    for reason in graph.supervisor.unclean:
+        complain(f"slrig {command}: at the end, {reason}")
+    return status or int(bool(graph.supervisor.unclean))
 
 
 async def supervise(options: GraphOptions) -> int:

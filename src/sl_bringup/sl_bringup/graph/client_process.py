@@ -19,7 +19,10 @@ from sl_common.topics import NAMESPACE
 
 def add_client_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments that say which graph is meant."""
-    parser.add_argument("--namespace", default=NAMESPACE, help="of the rig (default: /sl)")
+    parser.add_argument(
+        "--namespace", type=lambda text: "/" + text.strip("/"), default=NAMESPACE,
+        help="of the rig (default: /sl)",
+    )  # fmt: skip
     parser.add_argument(
         "--domain", type=int, default=int(os.environ.get("ROS_DOMAIN_ID") or 0),
         help="ROS domain, 0 to 101 (default: ROS_DOMAIN_ID, else 0)",
@@ -29,25 +32,27 @@ def add_client_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def transport_of(args: argparse.Namespace) -> Transport:
+    """Transport of the graph that parsed arguments mean."""
+    return Transport(runtime_directory(args.domain), args.domain, args.network)
+
+
 def become_client(
-    module: str, args: argparse.Namespace, words: Sequence[str], segment: str = ""
+    module: str, words: Sequence[str], transport: Transport, segment: str = ""
 ) -> NoReturn:
     """Replace this process by a client of the graph.
 
     Parameters
     ----------
     module : str
-        With `main`.
-    args : Namespace
-        From a parser with `add_client_arguments`.
+        With `main`, which parses the words as `sl_bringup.cli.main.parse` does.
     words : sequence of str
-        The client's arguments.
+        The command's options.
+    transport : Transport
+        Of the graph.
     segment : str
         Node whose shared memory the client needs, where it publishes large messages.
     """
-    transport = Transport(runtime_directory(args.domain), args.domain, args.network)
     environment = process_environment(transport.environment(segment))
-    namespace = "/" + args.namespace.strip("/")
-    command = [sys.executable, "-m", module, "--namespace", namespace, *words]
     sys.stdout.flush()
-    os.execve(sys.executable, command, environment)
+    os.execve(sys.executable, [sys.executable, "-m", module, *words], environment)

@@ -10,6 +10,9 @@ _BAR = 24
 #: Redraws a second on a terminal; elsewhere (logs) a line every so many seconds.
 _REDRAW_S, _LOG_S = 0.1, 5.0
 
+#: Exit status of a command that was interrupted.
+INTERRUPTED = 130
+
 
 def say(line: str) -> None:
     """Write a line to standard output at once."""

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import yaml
 
-from sl_bringup.graph.graph import GraphOptions, client_command, client_environment
+from sl_bringup.graph.graph import GraphOptions, client_environment, readiness_command
 from sl_bringup.graph.graph_config import write_config
 from sl_bringup.graph.transport import (
     MIB,
@@ -204,8 +204,7 @@ def graph(options: GraphOptions) -> list[Finding]:
     """A running graph and what its nodes say."""
     if not _there("rclpy"):
         return []
-    wanted = ("--nodes", *options.nodes, "--timeout", "4", "--states")
-    command = client_command("sl_bringup.ready_node", options, *wanted)
+    command = readiness_command(options, "--timeout", "4", "--states")
     asked: Any = subprocess.run(
         command, env=client_environment(options), capture_output=True, text=True, check=False
     )

@@ -7,11 +7,11 @@ import contextlib
 import fcntl
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import IO, NoReturn
+from typing import IO
 
 from sl_bringup.graph.graph_config import (
     TRUE_RIG,
@@ -71,20 +71,17 @@ class GraphOptions:
         return Transport(self.directory, self.domain, self.network)
 
 
-def client_command(module: str, options: GraphOptions, *arguments: str) -> tuple[str, ...]:
-    """Command of a ROS client of the graph.
+def client_command(module: str, *arguments: str) -> tuple[str, ...]:
+    """Command of a ROS client.
 
     Parameters
     ----------
     module : str
         The client's module.
-    options : GraphOptions
-        Domain and namespace.
     *arguments : str
-        The client's own.
+        Its own.
     """
-    namespace = options.changes.namespace
-    return (sys.executable, "-m", module, "--namespace", namespace, *arguments)
+    return (sys.executable, "-m", module, *arguments)
 
 
 def client_environment(options: GraphOptions) -> dict[str, str]:
@@ -92,21 +89,19 @@ def client_environment(options: GraphOptions) -> dict[str, str]:
     return process_environment(options.transport.environment())
 
 
-def exec_client(module: str, options: GraphOptions, *arguments: str) -> NoReturn:
-    """Replace this process by a ROS client of the graph, so that signals reach it directly.
+def readiness_command(options: GraphOptions, *arguments: str) -> tuple[str, ...]:
+    """Command that asks whether a graph is ready.
 
     Parameters
     ----------
-    module : str
-        The client's module.
     options : GraphOptions
-        Domain and namespace.
+        Which graph.
     *arguments : str
-        The client's own.
+        Further options of `ready_node`.
     """
-    command = client_command(module, options, *arguments)
-    sys.stdout.flush()
-    os.execve(command[0], command, client_environment(options))
+    namespace = options.changes.namespace
+    wanted = ("--namespace", namespace, "--nodes", *options.nodes, *arguments)
+    return client_command("sl_bringup.ready_node", *wanted)
 
 
 class Graph:
@@ -120,7 +115,7 @@ class Graph:
         Gets every line of its processes.
     """
 
-    def __init__(self, options: GraphOptions, tell: Callable[[str], None]) -> None:
+    def __init__(self, options: GraphOptions, tell: Callable[[str], object]) -> None:
         self._options = options
         self._tell = tell
         self.supervisor = Supervisor(tell)
@@ -167,8 +162,8 @@ class Graph:
             Give up when something has been missing for this long; 0: never. The time in which
             only the compiler is waited for does not count.
         """
-        wanted = ("--nodes", *self._options.nodes, "--timeout", f"{timeout_s}")
-        if await self.run_client("sl_bringup.ready_node", *wanted, "--wait-for-compiler") != 0:
+        wanted = ("--timeout", f"{timeout_s}", "--wait-for-compiler")
+        if await self.run_client(readiness_command(self._options, *wanted)):
             return False
         return not self._options.bench or await self._await_bench(timeout_s)
 
@@ -185,10 +180,10 @@ class Graph:
                     self._tell("graph not ready: the bench does not answer")
                     return False
 
-    async def run_client(self, module: str, *arguments: str) -> int:
+    async def run_client(self, command: Sequence[str]) -> int:
         """Run a ROS client of this graph to its end, return its exit status."""
         self._client = await asyncio.create_subprocess_exec(
-            *client_command(module, self._options, *arguments),
+            *command,
             env=client_environment(self._options),
             stdin=asyncio.subprocess.DEVNULL,
             start_new_session=True,

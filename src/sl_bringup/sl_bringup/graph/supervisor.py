@@ -76,7 +76,7 @@ class Supervisor:
         Waits.
     """
 
-    def __init__(self, tell: Callable[[str], None], timing: Timing | None = None) -> None:
+    def __init__(self, tell: Callable[[str], object], timing: Timing | None = None) -> None:
         self._tell = tell
         self._timing = timing or Timing()
         self._stopping = asyncio.Event()
