@@ -119,7 +119,7 @@ def test_what_is_no_board_is_refused(scene) -> None:  # type: ignore[no-untyped-
     single = named("paper-rows", (320, 256))
     with pytest.raises(CalibrationError, match=r"white nor a pattern|in pairs"):
         board_view(stack[: len(single)], single, BOARD)
-    with pytest.raises(CalibrationError, match="unlike along both sides"):
+    with pytest.raises(CalibrationError, match="different along both sides"):
         Board(5, 5, 0.02)
     with pytest.raises(CalibrationError, match="decoded about the corner"):
         dark = stack.copy()

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sl_bench.world.mounting import Mounting
-from sl_calibration.bundle.bundle_adjustment import RigProblem
 from sl_calibration.bundle.covariance import triangle
 from sl_calibration.bundle.derivatives import intersect, meet, moved, project
 from sl_calibration.bundle.parameters import FlatPrior, Freedom
+from sl_calibration.bundle.rig_problem import RigProblem
 from sl_calibration.bundle.stage_model import StagePrior, stage_report
 from sl_calibration.data.solver_input import Holes, Targets
 from sl_common.errors import CalibrationError
@@ -81,9 +81,8 @@ def test_the_whole_bundle(square: bool) -> None:
     rng = np.random.default_rng(2)
     start = problem.moved(problem.start(scene.rig.camera, scene.rig.projector),
                           steps * rng.normal(0, 3, problem.size))  # fmt: skip
-    residuals, jacobian = problem.evaluate(start)
+    residuals, jacobian, prior, by_prior = problem.linearised(start)
     np.testing.assert_allclose(problem.residuals(start), residuals, atol=1e-6)
-    prior, by_prior = problem.priors(start)
     for i, step in enumerate(np.diag(steps)):
         up, down = problem.moved(start, step), problem.moved(start, -step)
         twin = (problem.residuals(up) - problem.residuals(down)) / (2 * steps[i])

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from sl_bench.world.mounting import Mounting
-from sl_calibration.bundle.bundle_adjustment import Bundle, RigProblem, solve_bundle
+from sl_calibration.bundle.bundle_adjustment import Bundle, solve_bundle
 from sl_calibration.bundle.parameters import FlatPrior, Freedom
+from sl_calibration.bundle.rig_problem import RigProblem
 from sl_calibration.bundle.stage_model import FAULTLESS, StagePrior
 from sl_calibration.data.solver_input import Holes, Targets
 from sl_calibration.solve.acceptance import Limits, judge

@@ -1,10 +1,9 @@
-"""A chessboard held anyhow, patterns thrown on it: camera and projector without plate or stage.
+"""A chessboard in free poses under patterns: camera and projector without plate or stage.
 
 Corners are the camera's points; the DMD coordinates there come from a homography between the
 Gray codes about each corner and the camera's pixels (Moreno and Taubin, 3DIMPVT 2012): codes are
-whole mirrors, hundreds of them average to some hundredths. A board need not be as flat as it
-should be, and that shows first where it is most askew: corners off the model are left out, by the
-rule that holes are left out by, and named.
+whole mirrors, hundreds of them average to some hundredths. A board that is not flat shows it
+first where it leans most: corners off the model are left out, by the rule for holes, and named.
 """
 
 from __future__ import annotations
@@ -16,25 +15,31 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_calibration.board.planar_target import MIN_VIEWS, FreePair, FreeSolution, solve_free_pair
+from sl_calibration.board.planar_target import (
+    MIN_VIEWS,
+    FreePair,
+    FreeSolution,
+    opencv_lens,
+    solve_free_pair,
+)
 from sl_calibration.data.view_extraction import white_image
 from sl_calibration.solve.linear_step import Sensor
 from sl_common.errors import CalibrationError
 from sl_projector.sequence.pattern_sequence import AXES, Axis, PatternSequence
-from sl_reconstruct.model.rig import BrownConrady
 
 Array = NDArray[np.float64]
 Stack = NDArray[np.uint8] | NDArray[np.uint16]
 
 #: Codes within this part of a square's side about a corner go into its homography.
 PATCH_PART = 0.55
-#: Every so many pixels of a patch, and the distance in mirrors from which a code is wrong.
+#: Step between the pixels of a patch that are looked at.
 PATCH_STEP = 2
+#: Distance in mirrors from which a code is wrong.
 WRONG_CODE_PX = 2.0
 #: White and black must differ by this part of the brightest difference where a code counts.
 MIN_LIGHT = 0.08
 MIN_CODES = 40
-#: Corners beyond so many robust sigmas of either device are left out ...
+#: Corners beyond this many robust sigmas of either device are left out ...
 OUTLIER_SIGMAS = 5.0
 ROUNDS = 6
 #: ... but not more than this part of all: then something else is wrong.
@@ -53,7 +58,7 @@ class Board:
         if min(self.columns, self.rows) < 3 or self.columns == self.rows or not self.square_m > 0:
             raise CalibrationError(
                 f"board of {self.columns} x {self.rows} corners, square_m={self.square_m}; "
-                "expected 3 or more, unlike along both sides, and a positive side"
+                "expected 3 or more, different along both sides, and a positive side"
             )
 
     @property
@@ -191,13 +196,13 @@ def solve_board(
     Parameters
     ----------
     views : sequence of BoardView
-        Three or more, the board leaning unlike.
+        Three or more, the board leaning differently in each.
     board : Board
         The board.
     sensors : tuple of Sensor
         Camera's and projector's.
     coefficients : {0, 2, 4, 5}
-        Of each lens, as in `free_poses.solve_free`.
+        Of each lens, as in `planar_target.solve_free`.
 
     Raises
     ------
@@ -206,8 +211,15 @@ def solve_board(
     """
     if len(views) < MIN_VIEWS:
         raise CalibrationError(f"{len(views)} views of the board; expected at least {MIN_VIEWS}")
+
+    def solved(used: NDArray[np.bool_]) -> FreePair:
+        points = [board.points_m[rows] for rows in used]
+        seen = [view.camera_px[rows] for view, rows in zip(views, used, strict=True)]
+        thrown = [view.dmd_px[rows] for view, rows in zip(views, used, strict=True)]
+        return solve_free_pair(points, seen, thrown, sensors, coefficients)
+
     used = np.ones((len(views), len(board.points_m)), dtype=bool)
-    first = pair = _solved(views, board, sensors, coefficients, used)
+    first = pair = solved(used)
     for _ in range(ROUNDS):
         keep = _near(pair.camera, [v.camera_px for v in views], board, used)
         keep &= _near(pair.projector, [v.dmd_px for v in views], board, used)
@@ -219,21 +231,8 @@ def solve_board(
                 f"{np.mean(~used):.0%} of the corners are off; expected at most "
                 f"{MAX_LEFT_OUT:.0%}: is the board flat, and are its squares what was said?"
             )
-        pair = _solved(views, board, sensors, coefficients, used)
+        pair = solved(used)
     return BoardSolution(pair, used, first.rms_px)
-
-
-def _solved(
-    views: Sequence[BoardView],
-    board: Board,
-    sensors: tuple[Sensor, Sensor],
-    coefficients: int,
-    used: NDArray[np.bool_],
-) -> FreePair:
-    points = [board.points_m[rows] for rows in used]
-    seen = [view.camera_px[rows] for view, rows in zip(views, used, strict=True)]
-    thrown = [view.dmd_px[rows] for view, rows in zip(views, used, strict=True)]
-    return solve_free_pair(points, seen, thrown, sensors, coefficients)
 
 
 def _near(
@@ -241,8 +240,7 @@ def _near(
 ) -> NDArray[np.bool_]:
     """Corners (V, N) that a device's model meets, its pose from the used ones."""
     device, points = solution.device, np.pad(board.points_m, ((0, 0), (0, 1)))
-    assert isinstance(device.lens, BrownConrady)
-    lens = (device.camera_matrix, np.array(device.lens.coefficients))
+    lens = opencv_lens(device)
     off = np.empty(used.shape)
     for i, (seen, rows) in enumerate(zip(pixels, used, strict=True)):
         _, turn, shift = cv2.solvePnP(points[rows], seen[rows], *lens)

@@ -1,4 +1,4 @@
-"""Devices from a flat target held anyhow, OpenCV's way: the lens model of Brown and Conrady.
+"""Devices from a flat target in free poses, OpenCV's way: the lens model of Brown and Conrady.
 
 For rigs without a stage: a board or dot plate in three or more unlike poses. The paper's model
 and the stage's knowledge are in `sl_calibration.solve.solution`; here OpenCV does the work.
@@ -7,7 +7,7 @@ and the stage's knowledge are in `sl_calibration.solve.solution`; here OpenCV do
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 MIN_VIEWS = 3
 MIN_POINTS = 6
-#: OpenCV's flags for a lens of so many coefficients: none; k1, k2; with p1, p2; with k3.
+#: OpenCV's flags by the number of a lens's coefficients: none; k1, k2; with p1, p2; with k3.
 _FIX_K12 = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
 LENSES = {
     0: _FIX_K12 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST,
@@ -31,8 +31,8 @@ LENSES = {
     5: 0,
 }
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-10)
-_NAMES = ("focal_length_px.0", "focal_length_px.1", "image_centre_px.0", "image_centre_px.1",
-          "k1", "k2", "p1", "p2", "k3")  # fmt: skip
+_NAMES = [f"{name}.{i}" for name in ("focal_length_px", "image_centre_px") for i in (0, 1)]
+_NAMES += ["k1", "k2", "p1", "p2", "k3"]
 
 
 @dataclass(frozen=True)
@@ -99,13 +99,10 @@ def solve_free(
         When there are too few views or points, or OpenCV finds no solution.
     """
     flags = _flags(coefficients)
-    flat, seen = _checked(points_m, pixels)
-    found = _opencv(
-        cv2.calibrateCameraExtended, flat, seen, sensor.image_size, None, None,
-        flags=flags, criteria=_STOP,
-    )  # fmt: skip
+    points = (*_checked(points_m, pixels), sensor.image_size, None, None)
+    found = _opencv(cv2.calibrateCameraExtended, *points, flags=flags, criteria=_STOP)
     rms_px, matrix, distortion, _, _, sigma, _, per_view = found
-    device = _device(matrix, distortion, np.eye(3), np.zeros(3), sensor)
+    device = _device(matrix, distortion, sensor)
     sigmas = dict(zip(_NAMES, map(float, np.ravel(sigma)), strict=False))
     return FreeSolution(device, float(rms_px), np.ravel(per_view).astype(np.float64), sigmas)
 
@@ -137,17 +134,14 @@ def solve_free_pair(
     projector = solve_free(points_m, projector_px, sensors[1], coefficients)
     flat, seen = _checked(points_m, camera_px)
     _, thrown = _checked(points_m, projector_px)
-    lenses = [_opencv_lens(solution.device) for solution in (camera, projector)]
-    found = _opencv(
-        cv2.stereoCalibrate, flat, seen, thrown, *lenses[0], *lenses[1], sensors[0].image_size,
-        flags=_flags(coefficients) | cv2.CALIB_USE_INTRINSIC_GUESS, criteria=_STOP,
-    )  # fmt: skip
+    lenses = (*opencv_lens(camera.device), *opencv_lens(projector.device), sensors[0].image_size)
+    flags = _flags(coefficients) | cv2.CALIB_USE_INTRINSIC_GUESS
+    points = (flat, seen, thrown)
+    found = _opencv(cv2.stereoCalibrate, *points, *lenses, flags=flags, criteria=_STOP)
     rms_px, k1, d1, k2, d2, rotation, translation, *_ = found
-    rig = Rig(
-        _device(k1, d1, np.eye(3), np.zeros(3), sensors[0]),
-        _device(k2, d2, rotation, np.ravel(translation), sensors[1]),
-    )
-    return FreePair(camera, projector, rig, float(rms_px))
+    thrower = _device(k2, d2, sensors[1])
+    thrower = replace(thrower, rotation=rotation, translation_m=np.ravel(translation))
+    return FreePair(camera, projector, Rig(_device(k1, d1, sensors[0]), thrower), float(rms_px))
 
 
 def _flags(coefficients: int) -> int:
@@ -185,17 +179,16 @@ def _opencv(function: Any, *arguments: Any, **options: Any) -> Any:
     return found
 
 
-def _opencv_lens(device: Device) -> tuple[Array, Array]:
+def opencv_lens(device: Device) -> tuple[Array, Array]:
+    """Camera matrix (3, 3) and distortion (5,) of a device with OpenCV's lens."""
     assert isinstance(device.lens, BrownConrady)
     return device.camera_matrix, np.array(device.lens.coefficients)
 
 
-def _device(
-    matrix: Array, distortion: Array, rotation: Array, translation_m: Array, sensor: Sensor
-) -> Device:
+def _device(matrix: Array, distortion: Array, sensor: Sensor) -> Device:
+    """Device in a frame of its own."""
     k1, k2, p1, p2, k3 = (float(c) for c in np.ravel(distortion)[:5])
-    return Device(
-        sensor.image_size, (float(matrix[0, 0]), float(matrix[1, 1])),
-        (float(matrix[0, 2]), float(matrix[1, 2])), sensor.pixel_pitch_m,
-        rotation, translation_m, BrownConrady((k1, k2, p1, p2, k3)),
-    )  # fmt: skip
+    (fx, _, cu), (_, fy, cv), _ = matrix.tolist()
+    lens = BrownConrady((k1, k2, p1, p2, k3))
+    size, pitch_m = sensor
+    return Device(size, (fx, fy), (cu, cv), pitch_m, np.eye(3), np.zeros(3), lens)

@@ -1,249 +1,37 @@
-"""The full bundle over all parameters: one device, or camera and projector together.
+"""The full bundle adjustment: robust descent, rejection of wrong points, covariance.
 
-Unknown are, of each device, f (or fx, fy), C, kappa, R and T; of the stage, its true directions
-and scales (and, where its readings are not trusted, each position); of the flat that patterns
-fall on, its offset and slopes against the plate. The world is held by the plate: where it lies
-when the stage reads zero, and its pitch, are the reference.
+Levenberg-Marquardt under Cauchy weights, then with the points that are left (`outlier_rejection`),
+every step and the covariance from one QR factorisation (`covariance`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_calibration.bundle.derivatives import PARAMETERS, intersect, meet, moved, project
-from sl_calibration.bundle.parameters import Freedom, State, lens_values
-from sl_calibration.bundle.robust_lm import solve
-from sl_calibration.bundle.stage_model import StageReport, axis_priors, moving_axes, stage_report
-from sl_calibration.data.solver_input import Holes, Targets
+from sl_calibration.bundle.covariance import Linearised, weighted_system
+from sl_calibration.bundle.outlier_rejection import (
+    cauchy_weights,
+    inlier_weights,
+    inliers,
+    sigma_scales,
+)
+from sl_calibration.bundle.parameters import State
+from sl_calibration.bundle.rig_problem import RigProblem
+from sl_calibration.bundle.stage_model import StageReport, stage_report
+from sl_common.errors import CalibrationError
 from sl_reconstruct.model.calibration_file import Covariance
-from sl_reconstruct.model.rig import Device
 
 Array = NDArray[np.float64]
 
-
-#: What a fixed lens may move by: millionths of what any calibration can tell.
-_FIXED_SIGMA = np.array([1e-5, 1e-5, 1e-5, 1e-16])
-
-
-@dataclass(frozen=True)
-class RigProblem:
-    """Residuals and derivatives of holes and targets by all parameters.
-
-    Parameters
-    ----------
-    names : tuple of str
-        The devices', for the parameters' names: camera, or camera and projector.
-    holes : Holes
-        Seen by the first device.
-    targets : Targets
-        Named by the first and the second device.
-    freedom : Freedom
-        What is estimated.
-    """
-
-    names: tuple[str, ...]
-    holes: Holes
-    targets: Targets
-    freedom: Freedom
-
-    @property
-    def groups(self) -> Sequence[slice]:
-        """Holes and targets."""
-        holes = len(self.holes.pixels)
-        return slice(0, holes), slice(holes, holes + len(self.targets.pixels))
-
-    @property
-    def sigma_px(self) -> Array:
-        """Stated 1-sigma (M, 2) of holes, then targets."""
-        return np.concatenate([self.holes.sigma_px, self.targets.sigma_px])
-
-    @cached_property
-    def positions_m(self) -> Array:
-        """The stage's positions (K, 3), each once."""
-        both = np.concatenate([self.holes.stage_m, self.targets.stage_m])
-        return np.unique(both, axis=0)
-
-    @cached_property
-    def moving(self) -> tuple[int, ...]:
-        """Axes of the stage that are estimated."""
-        return () if self.freedom.stage.held else moving_axes(self.positions_m)
-
-    @property
-    def device_size(self) -> int:
-        """Number of a device's parameters."""
-        return PARAMETERS - self.freedom.square_pixels
-
-    def chosen(self, by_device: Array) -> Array:
-        """Derivatives (..., 11) by a device, as its columns have them: f is fx and fy."""
-        if not self.freedom.square_pixels:
-            return by_device
-        focal = by_device[..., :1] + by_device[..., 1:2]
-        return np.concatenate([focal, by_device[..., 2:]], axis=-1)
-
-    def device_step(self, step: Array) -> Array:
-        """Step of a device's columns, as its eleven parameters have it."""
-        return np.concatenate([step[:1], step]) if self.freedom.square_pixels else step
-
-    @cached_property
-    def columns(self) -> dict[str, slice]:
-        """Where each block of parameters stands."""
-        sizes = dict.fromkeys(self.names, self.device_size)
-        sizes["axes"] = 3 * len(self.moving)
-        sizes["errors"] = 3 * len(self.positions_m) * (self.freedom.stage.position_sigma_m > 0)
-        sizes["flat"] = 3 * (self.freedom.flat is not None)
-        ends = [int(end) for end in np.cumsum(list(sizes.values()))]
-        starts = [0, *ends[:-1]]
-        return {name: slice(a, b) for name, a, b in zip(sizes, starts, ends, strict=True)}
-
-    @property
-    def size(self) -> int:
-        """Number of parameters P."""
-        return int(self.columns["flat"].stop)
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters, in order."""
-        focal = [""] if self.freedom.square_pixels else [".0", ".1"]
-        device = [f"focal_length_px{i}" for i in focal]
-        device += [f"image_centre_px.{i}" for i in range(2)] + ["kappa"]
-        device += [f"{what}.{i}" for what in ("rotation_rad", "translation_m") for i in range(3)]
-        names = [f"{name}.{parameter}" for name in self.names for parameter in device]
-        names += [f"stage.{'xyz'[axis]}_axis.{i}" for axis in self.moving for i in range(3)]
-        if self.freedom.stage.position_sigma_m > 0:
-            count = len(self.positions_m)
-            names += [f"stage.position_m.{k}.{i}" for k in range(count) for i in range(3)]
-        if self.freedom.flat is not None:
-            names += ["flat.offset_m", "flat.slope_x", "flat.slope_y"]
-        return tuple(names)
-
-    def moved(self, state: State, step: Array) -> State:
-        """See `sl_calibration.bundle.robust_lm.Problem`."""
-        axes = state.axes.copy()
-        axes[:, list(self.moving)] += step[self.columns["axes"]].reshape(-1, 3).T
-        errors = step[self.columns["errors"]].reshape(-1, 3)
-        flat = step[self.columns["flat"]]
-        devices = tuple(
-            moved(device, self.device_step(step[self.columns[name]]))
-            for name, device in zip(self.names, state.devices, strict=True)
-        )
-        moved_errors = state.errors_m + errors if len(errors) else state.errors_m
-        return State(devices, axes, moved_errors, state.flat + flat if len(flat) else state.flat)
-
-    def start(self, *devices: Device) -> State:
-        """State with a faultless stage and the patterns on the plate's plane."""
-        return State(devices, np.eye(3), np.zeros_like(self.positions_m), np.zeros(3))
-
-    def residuals(self, state: State) -> Array:
-        """Residuals (M, 2), predicted less observed, in sigmas."""
-        points = self.holes.points_m + self._shift(state, 0)
-        parts = [(state.devices[0].project(points) - self.holes.pixels) / self.holes.sigma_px]
-        if len(self.targets.pixels):
-            normal, height, _ = self.planes(state)
-            met = meet(state.devices[0], self.targets.camera_px, normal, height)
-            difference = state.devices[1].project(met) - self.targets.pixels
-            parts.append(difference / self.targets.sigma_px)
-        return np.concatenate(parts)
-
-    def _shift(self, state: State, group: int) -> Array:
-        """How far the stage has moved each hole (0) or target (1), (N, 3)."""
-        data = (self.holes, self.targets)[group]
-        return np.asarray(data.stage_m @ state.axes.T + state.errors_m[self._places[group]])
-
-    def planes(self, state: State) -> tuple[Array, Array, Array]:
-        """Normal of the flat (3,), h of each target's plane (N,), and its shift (N, 3)."""
-        normal = np.array([-state.flat[1], -state.flat[2], 1.0])
-        shift = self._shift(state, 1)
-        return normal, state.flat[0] + shift @ normal, shift
-
-    def evaluate(self, state: State) -> tuple[Array, Array]:
-        """Residuals (M, 2), predicted less observed, in sigmas, and derivatives (M, 2, P)."""
-        parts = [self._holes(state)]
-        if len(self.targets.pixels):
-            parts.append(self._targets(state))
-        return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
-
-    def _place(self, stage_m: Array) -> NDArray[np.intp]:
-        """Index of each row's stage position."""
-        apart = np.abs(stage_m[:, np.newaxis] - self.positions_m).sum(axis=2)
-        return np.asarray(np.argmin(apart, axis=1), dtype=np.intp)
-
-    @cached_property
-    def _places(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        return self._place(self.holes.stage_m), self._place(self.targets.stage_m)
-
-    def _holes(self, state: State) -> tuple[Array, Array]:
-        data, place = self.holes, self._places[0]
-        seen = project(state.devices[0], data.points_m + self._shift(state, 0))
-        jacobian = np.zeros((len(place), 2, self.size))
-        jacobian[:, :, self.columns[self.names[0]]] = self.chosen(seen.by_device)
-        self._by_shift(jacobian, seen.by_point, data.stage_m, place)
-        return _in_sigmas(seen.pixels - data.pixels, jacobian, data.sigma_px)
-
-    def _by_shift(
-        self, jacobian: Array, by_shift: Array, stage_m: Array, place: NDArray[np.intp]
-    ) -> None:
-        """Derivatives by the stage, from those by the shift (N, 2, 3) of the part."""
-        first = self.columns["axes"].start
-        for i, axis in enumerate(self.moving):
-            block = slice(first + 3 * i, first + 3 * i + 3)
-            jacobian[:, :, block] = by_shift * stage_m[:, axis, np.newaxis, np.newaxis]
-        if self.freedom.stage.position_sigma_m > 0:
-            rows = np.arange(len(place))
-            for i in range(3):
-                jacobian[rows, :, self.columns["errors"].start + 3 * place + i] = by_shift[:, :, i]
-
-    def _targets(self, state: State) -> tuple[Array, Array]:
-        data, place = self.targets, self._places[1]
-        camera, projector = state.devices
-        normal, height, shift = self.planes(state)
-        hit = intersect(camera, data.camera_px, normal, height)
-        seen = project(projector, hit.points_m)
-        by_height = np.einsum("nij,nj->ni", seen.by_point, hit.by_height)
-        jacobian = np.zeros((len(shift), 2, self.size))
-        by_camera = seen.by_point @ hit.by_device
-        jacobian[:, :, self.columns[self.names[0]]] = self.chosen(by_camera)
-        jacobian[:, :, self.columns[self.names[1]]] = self.chosen(seen.by_device)
-        self._by_shift(jacobian, by_height[:, :, np.newaxis] * normal, data.stage_m, place)
-        if self.freedom.flat is not None:
-            across = (hit.points_m - shift)[:, np.newaxis, :2]
-            level = by_height[:, :, np.newaxis]
-            jacobian[:, :, self.columns["flat"]] = np.concatenate([level, level * across], axis=2)
-        return _in_sigmas(seen.pixels - data.pixels, jacobian, data.sigma_px)
-
-    def priors(self, state: State) -> tuple[Array, Array]:
-        """Residuals (K,) of stage, flat and lens against what is known, derivatives (K, P)."""
-        parts: list[tuple[Array, Array, slice]] = []
-        stage, flat = self.freedom.stage, self.freedom.flat
-        for i, axis in enumerate(self.moving):
-            first = self.columns["axes"].start + 3 * i
-            parts.append((*axis_priors(state.axes, axis, stage), slice(first, first + 3)))
-        if stage.position_sigma_m > 0:
-            values = state.errors_m.ravel() / stage.position_sigma_m
-            scale = np.eye(len(values)) / stage.position_sigma_m
-            parts.append((values, scale, self.columns["errors"]))
-        if flat is not None:
-            sigma = np.array([flat.offset_sigma_m, flat.slope_sigma, flat.slope_sigma])
-            parts.append((state.flat / sigma, np.diag(1 / sigma), self.columns["flat"]))
-        if fixed := self.freedom.fixed:
-            first = self.columns[fixed.name].start
-            off = lens_values(state.devices[self.names.index(fixed.name)]) - fixed.values
-            scale = np.diag(1 / _FIXED_SIGMA)
-            parts.append((off / _FIXED_SIGMA, scale, slice(first, first + 4)))
-        jacobian = np.zeros((sum(len(values) for values, _, _ in parts), self.size))
-        row = 0
-        for values, block, columns in parts:
-            jacobian[row : row + len(values), columns] = block
-            row += len(values)
-        return np.concatenate([np.empty(0), *(values for values, _, _ in parts)]), jacobian
-
-
-def _in_sigmas(difference: Array, jacobian: Array, sigma: Array) -> tuple[Array, Array]:
-    return difference / sigma, jacobian / sigma[:, :, np.newaxis]
+_MAX_STEPS = 30
+_MAX_REJECTIONS = 6
+_MAX_DAMPING = 1e9
+#: Converged when a step can lower the cost by no more than this part of it.
+_STILL = 1e-7
 
 
 @dataclass(frozen=True)
@@ -297,13 +85,13 @@ class Bundle:
         """Median length of all residuals in sigmas: what tells a right start from a wrong one."""
         return float(np.median(np.hypot(*(self.residuals_px / self.problem.sigma_px).T)))
 
-    def linearised(self) -> tuple[Array, Array]:
-        """Residuals (M, 2) and derivatives (M, 2, P) at the solution, in the enlarged sigmas."""
-        residuals, jacobian = self.problem.evaluate(self.state)
+    def linearised(self) -> Linearised:
+        """Residuals and derivatives at the solution, in the enlarged sigmas."""
+        at = self.problem.linearised(self.state)
         for group, scale in zip(self.problem.groups, self.scales, strict=True):
-            residuals[group] /= scale
-            jacobian[group] /= scale
-        return residuals, jacobian
+            at.residuals[group] /= scale
+            at.jacobian[group] /= scale
+        return at
 
     def residuals_of(self, group: int) -> Array:
         """Residuals (N, 2) of used holes (0) or targets (1), pixels."""
@@ -321,7 +109,7 @@ def rms(vectors: Array) -> float:
 
 
 def solve_bundle(problem: RigProblem, start: State) -> Bundle:
-    """Solve from a start.
+    """Minimise the residuals, leave out wrong points, and say how well the parameters are known.
 
     Parameters
     ----------
@@ -333,9 +121,70 @@ def solve_bundle(problem: RigProblem, start: State) -> Bundle:
     Raises
     ------
     CalibrationError
-        As `sl_calibration.bundle.robust_lm.solve`.
+        When too few points are left or the points do not determine the parameters.
     """
-    state, fit = solve(problem, start)
-    covariance = Covariance(problem.parameters, fit.covariance)
-    residuals_px = fit.residuals * problem.sigma_px
-    return Bundle(problem, state, covariance, residuals_px, fit.used, fit.chi2, fit.dof, fit.scales)
+    groups = problem.groups
+    state = _descend(problem, start, lambda residuals: cauchy_weights(residuals, groups))
+    used: NDArray[np.bool_] | None = None
+    for _ in range(_MAX_REJECTIONS):
+        residuals = problem.residuals(state)
+        good = inliers(residuals, groups)
+        if used is not None and (good == used).all():
+            break
+        used = good
+        weights = inlier_weights(residuals, used, groups)
+        state = _descend(problem, state, lambda _, fixed=weights: fixed)  # type: ignore[misc]
+    return _solved(problem, state, np.asarray(used))
+
+
+def _solved(problem: RigProblem, state: State, used: NDArray[np.bool_]) -> Bundle:
+    at, groups = problem.linearised(state), problem.groups
+    system = weighted_system(at, inlier_weights(at.residuals, used, groups))
+    return Bundle(
+        problem,
+        state,
+        Covariance(problem.parameters, system.covariance()),
+        residuals_px=at.residuals * problem.sigma_px,
+        used=used,
+        chi2=_cost(problem, state, used.astype(np.float64)),
+        dof=system.dof,
+        scales=sigma_scales(at.residuals, used, groups),
+    )
+
+
+def _cost(problem: RigProblem, state: State, weights: Array) -> float:
+    """Cost of a state, infinite where there is none."""
+    residuals, prior = problem.residuals(state), problem.priors(state)[0]
+    used = weights > 0
+    cost = np.sum(weights[used] * np.sum(residuals[used] ** 2, axis=1)) + prior @ prior
+    return float(cost) if np.isfinite(cost) else np.inf
+
+
+def _descend(problem: RigProblem, state: State, weigh: Callable[[Array], Array]) -> State:
+    """Levenberg-Marquardt; the weights are renewed at each step."""
+    damping = 1e-6
+    for _ in range(_MAX_STEPS):
+        here = problem.linearised(state)
+        weights = weigh(here.residuals)
+        system = weighted_system(here, weights)
+        while True:
+            candidate, cost = _try(problem, state, system.step(damping), weights)
+            if cost <= system.cost:
+                break
+            damping *= 10
+            if damping > _MAX_DAMPING:
+                return state
+        state = candidate
+        damping = max(damping / 10, 1e-12)
+        if system.cost - cost <= _STILL * (system.cost + 1e-6):
+            break
+    return state
+
+
+def _try(problem: RigProblem, state: State, step: Array, weights: Array) -> tuple[State, float]:
+    """State after a step and its cost; infinite where the step leads nowhere."""
+    try:
+        candidate = problem.moved(state, step)
+    except CalibrationError:
+        return state, np.inf
+    return candidate, _cost(problem, candidate, weights)

@@ -9,6 +9,7 @@ M^-1 before them, which needs no derivative of the root that `Division.distort` 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -22,9 +23,8 @@ Array = NDArray[np.float64]
 
 #: Columns of a device's derivatives.
 PARAMETERS = 11
-FOCAL, CENTRE, KAPPA, ROTATION, TRANSLATION = (
-    slice(0, 2), slice(2, 4), 4, slice(5, 8), slice(8, 11),
-)  # fmt: skip
+FOCAL, CENTRE, KAPPA = slice(0, 2), slice(2, 4), 4
+ROTATION, TRANSLATION = slice(5, 8), slice(8, 11)
 
 
 class Projection(NamedTuple):
@@ -62,7 +62,7 @@ def kappa_of(device: Device) -> float:
     return device.lens.kappa
 
 
-def cross_matrix(v: Array) -> Array:
+def _cross_matrix(v: Array) -> Array:
     """Matrices [v]x (..., 3, 3) with ``[v]x w = v x w``."""
     x, y, z = np.moveaxis(v, -1, 0)
     o = np.zeros_like(x)
@@ -71,7 +71,14 @@ def cross_matrix(v: Array) -> Array:
 
 
 def moved(device: Device, step: Array) -> Device:
-    """Return the device with a step (11,) added to its parameters; see the module for the order.
+    """Add a step to a device's parameters.
+
+    Parameters
+    ----------
+    device : Device
+        With the paper's lens.
+    step : ndarray, (11,)
+        In the order that the module's docstring states.
 
     Raises
     ------
@@ -82,15 +89,18 @@ def moved(device: Device, step: Array) -> Device:
     left, _, right = np.linalg.svd(turn @ device.rotation)
     fx, fy = device.focal_px + step[FOCAL]
     u, v = device.centre_px + step[CENTRE]
-    return Device(
-        device.image_size, (float(fx), float(fy)), (float(u), float(v)), device.pixel_pitch_m,
-        left @ right, device.translation_m + step[TRANSLATION],
-        Division(kappa_of(device) + float(step[KAPPA])),
-    )  # fmt: skip
+    return replace(
+        device,
+        focal_length_px=(float(fx), float(fy)),
+        image_centre_px=(float(u), float(v)),
+        rotation=left @ right,
+        translation_m=device.translation_m + step[TRANSLATION],
+        lens=Division(kappa_of(device) + float(step[KAPPA])),
+    )
 
 
-def lens_matrix(offset_px: Array, kappa: float) -> Array:
-    """Return M = ds/dd (N, 2, 2) of observed offsets d (N, 2)."""
+def _lens_matrix(offset_px: Array, kappa: float) -> Array:
+    """M = ds/dd (N, 2, 2) of observed offsets d (N, 2)."""
     x, y = offset_px.T
     r2 = x * x + y * y
     mixed = 2 * kappa * x * y
@@ -108,11 +118,19 @@ def _inverse(matrix: Array) -> Array:
 
 
 def project(device: Device, points_m: Array) -> Projection:
-    """Observed pixels of world points (N, 3) with derivatives; NaN behind the device."""
+    """Observed pixels of world points with derivatives; NaN behind the device.
+
+    Parameters
+    ----------
+    device : Device
+        With the paper's lens.
+    points_m : ndarray, (N, 3)
+        World points, metres.
+    """
     kappa = kappa_of(device)
     pixels = device.project(points_m)
     offset = pixels - device.centre_px
-    inverse = _inverse(lens_matrix(offset, kappa))
+    inverse = _inverse(_lens_matrix(offset, kappa))
     turned = points_m @ device.rotation.T
     local = turned + device.translation_m
     slope = local[:, :2] / local[:, 2:]
@@ -130,7 +148,13 @@ def project(device: Device, points_m: Array) -> Projection:
 
 
 def meet(device: Device, pixels: Array, normal: Array, height_m: Array) -> Array:
-    """World points (N, 3) where rays meet planes, without derivatives; see `intersect`."""
+    """World points (N, 3) where rays meet planes, without derivatives.
+
+    Parameters
+    ----------
+    device, pixels, normal, height_m
+        As in `intersect`; any lens.
+    """
     origin, rays = device.position_m, device.rays(pixels)
     return np.asarray(origin + rays * ((height_m - normal @ origin) / (rays @ normal))[:, None])
 
@@ -160,7 +184,7 @@ def intersect(device: Device, pixels: Array, normal: Array, height_m: Array) -> 
     arm = depth * ray - device.translation_m
     by_ray = np.zeros((len(pixels), 3, PARAMETERS))
     by_ray[:, [0, 1], [0, 1]] = -slope / device.focal_px
-    by_ray[:, :2, CENTRE] = -lens_matrix(offset, kappa) / device.focal_px[:, np.newaxis]
+    by_ray[:, :2, CENTRE] = -_lens_matrix(offset, kappa) / device.focal_px[:, np.newaxis]
     by_ray[:, :2, KAPPA] = offset * r2 / device.focal_px
     # d(depth): through the ray, through the turn of the plane as the device sees it, through T
     by_depth = -depth * np.einsum("i,nij->nj", local_normal, by_ray)
@@ -169,6 +193,6 @@ def intersect(device: Device, pixels: Array, normal: Array, height_m: Array) -> 
     by_depth /= facing
     local = by_depth[:, np.newaxis, :] * ray[:, :, np.newaxis]
     local += depth[:, :, np.newaxis] * by_ray
-    local[:, :, ROTATION] += cross_matrix(arm)
+    local[:, :, ROTATION] += _cross_matrix(arm)
     local[:, :, TRANSLATION] -= np.eye(3)
     return Hit(arm @ device.rotation, device.rotation.T @ local, ray / facing @ device.rotation)

@@ -1,4 +1,4 @@
-"""What the stage's axes really do, as the plate sees it, and what is known of them beforehand.
+"""What the stage's axes really do, as the plate sees it, and what is known of them before.
 
 A stage reading s moves the plate by ``A s`` (+ a small error of each position); the columns of A
 are the true directions and scales of the axes in the plate's frame. Lengths on the plate are the
@@ -61,7 +61,17 @@ def moving_axes(stage_m: Array) -> tuple[int, ...]:
 
 
 def axis_priors(axes: Array, axis: int, prior: StagePrior) -> tuple[Array, Array]:
-    """Residuals in sigmas (K,) of one axis, derivatives (K, 3) by its column of A."""
+    """Residuals in sigmas (K,) of one axis, derivatives (K, 3) by its column of A.
+
+    Parameters
+    ----------
+    axes : ndarray, (3, 3)
+        A.
+    axis : {0, 1, 2}
+        x, y or z.
+    prior : StagePrior
+        What is known of the stage.
+    """
     column = axes[:, axis]
     length = float(np.linalg.norm(column))
     # A sigma of zero holds the value: a millionth of what matters stands for it.
@@ -113,24 +123,25 @@ def stage_report(axes: Array, covariance: Array, moving: tuple[int, ...]) -> Sta
     """
     length = np.linalg.norm(axes, axis=0)
     unit = axes / length
-    scale_rows = np.zeros((3, 9))
+    lean = axes[:2, _Z] / axes[_Z, _Z]
+    square = np.array([unit[:, i] @ unit[:, j] for i, j in _PAIRS])
+    by_scale, by_lean, by_square = np.zeros((3, 9)), np.zeros((2, 9)), np.zeros((3, 9))
     for i in range(3):
-        scale_rows[i, 3 * i : 3 * i + 3] = unit[:, i]
-    lean_rows = np.zeros((2, 9))
-    lean_rows[:, 6:8] = np.eye(2) / axes[2, 2]
-    lean_rows[:, 8] = -axes[:2, 2] / axes[2, 2] ** 2
-    square_rows = np.zeros((3, 9))
-    for row, (i, j) in zip(square_rows, _PAIRS, strict=True):
-        row[3 * i : 3 * i + 3] = (unit[:, j] - unit[:, i] * (unit[:, i] @ unit[:, j])) / length[i]
-        row[3 * j : 3 * j + 3] = (unit[:, i] - unit[:, j] * (unit[:, i] @ unit[:, j])) / length[j]
+        by_scale[i, 3 * i : 3 * i + 3] = unit[:, i]
+    by_lean[:, 6:8] = np.eye(2) / axes[_Z, _Z]
+    by_lean[:, 8] = -axes[:2, _Z] / axes[_Z, _Z] ** 2
+    for row, cosine, (i, j) in zip(by_square, square, _PAIRS, strict=True):
+        row[3 * i : 3 * i + 3] = (unit[:, j] - unit[:, i] * cosine) / length[i]
+        row[3 * j : 3 * j + 3] = (unit[:, i] - unit[:, j] * cosine) / length[j]
     known = np.array([i in moving for i in range(3)])
     both = np.array([known[i] and known[j] for i, j in _PAIRS])
-    squareness = np.array([np.arcsin(unit[:, i] @ unit[:, j]) for i, j in _PAIRS])
-    sigma = [np.sqrt(np.diag(r @ covariance @ r.T)) for r in (scale_rows, lean_rows, square_rows)]
-    nan = np.nan
-    return StageReport(
-        np.where(known, length, nan), np.where(known, sigma[0], nan),
-        np.where(known[_Z], np.arctan(axes[:2, 2] / axes[2, 2]), nan),
-        np.where(known[_Z], sigma[1], nan),
-        np.where(both, squareness, nan), np.where(both, sigma[2], nan),
-    )  # fmt: skip
+    quantities = (
+        (length, by_scale, known),
+        (np.arctan(lean), by_lean, known[_Z]),
+        (np.arcsin(square), by_square, both),
+    )
+    found = []
+    for value, rows, sure in quantities:
+        sigma = np.sqrt(np.diag(rows @ covariance @ rows.T))
+        found += [np.where(sure, value, np.nan), np.where(sure, sigma, np.nan)]
+    return StageReport(*found)

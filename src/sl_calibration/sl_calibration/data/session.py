@@ -53,12 +53,12 @@ class CalibrationRequest:
     sequence : str
         Patterns, both axes.
     travel_m : float
-        Two further views, moved so far in x and in y, at the middle height: they tell a plate that
-        leans from a stage that is not square. 0 for none.
+        Distance of two further views, moved in x and in y, at the middle height: they tell a plate
+        that leans from a stage that is not square. 0 for none.
     patterns : bool
         Whether the projector's coordinates are wanted, or the plate's holes only.
     least : int
-        So many different heights are needed.
+        Number of different heights that are needed.
     """
 
     target: str

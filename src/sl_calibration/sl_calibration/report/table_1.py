@@ -35,10 +35,9 @@ def table_1(content: Mapping[str, Any]) -> list[tuple[str, ...]]:
     paper = {**PAPER_TABLE_1, "Residual on the part, µm rms": ("15", "10")}
     devices = [content.get("projector"), content.get("camera")]
     return [
-        (name, *(cell(d) if d else "" for d in devices),
-         ", ".join(paper[name]) if name in paper else "")
+        (name, *(cell(d) if d else "" for d in devices), ", ".join(paper.get(name, ())))
         for name, cell in cells.items()
-    ]  # fmt: skip
+    ]
 
 
 def _focal_cell(device: Mapping[str, Any]) -> str:

@@ -45,8 +45,7 @@ def leave_heights_out(bundle: Bundle) -> tuple[HeightError, ...]:
     distinct = np.unique(heights)
     if len(distinct) < 3:
         return ()
-    residuals, jacobian = bundle.linearised()
-    prior, by_prior = problem.priors(bundle.state)
+    residuals, jacobian, prior, by_prior = bundle.linearised()
     found = []
     for height_m in distinct:
         others = bundle.used & (heights != height_m)
@@ -64,8 +63,7 @@ def leave_heights_out(bundle: Bundle) -> tuple[HeightError, ...]:
 
 def _compare(bundle: Bundle, state: State, rows: NDArray[np.bool_], height_m: float) -> HeightError:
     problem = bundle.problem
-    residuals, _ = problem.evaluate(state)
-    residuals *= problem.sigma_px
+    residuals = problem.linearised(state).residuals * problem.sigma_px
     hole_rms, target_rms = (rms(residuals[group][rows[group]]) for group in problem.groups)
     z_error = _height_errors(bundle, state)[rows[problem.groups[1]], np.newaxis]
     return HeightError(height_m, hole_rms, target_rms, rms(z_error))

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from sl_calibration.bundle.bundle_adjustment import Bundle, RigProblem, solve_bundle
+from sl_calibration.bundle.bundle_adjustment import Bundle, solve_bundle
 from sl_calibration.bundle.covariance import triangle
 from sl_calibration.bundle.parameters import FixedLens, lens_values
+from sl_calibration.bundle.rig_problem import RigProblem
 from sl_calibration.solve.observability import check_solution
 from sl_common.errors import CalibrationError
 from sl_reconstruct.model.calibration_file import Calibration, Covariance
@@ -147,7 +148,7 @@ def _with_lens_uncertainty(bundle: Bundle, lens: FixedLens) -> Bundle:
 def _change_with_lens(bundle: Bundle, lens: NDArray[np.bool_]) -> Array:
     """Change of all other parameters with the lens, (P - 4, 4), at the solution."""
     problem = bundle.problem
-    _, jacobian = bundle.linearised()
+    jacobian = bundle.linearised().jacobian
     free = replace(problem, freedom=replace(problem.freedom, fixed=None))
     _, priors = free.priors(bundle.state)
     rows = np.concatenate([jacobian[bundle.used].reshape(-1, problem.size), priors])

@@ -14,7 +14,7 @@ from sl_reconstruct.model.rig import Device
 
 Array = NDArray[np.float64]
 
-#: First look: centres on a grid over so many image sizes about the middle, since a projector's
+#: First look: centres on a grid over this many image sizes about the middle, since a projector's
 #: centre lies at the DMD's border or beyond.
 _LOOK = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 
@@ -73,7 +73,6 @@ def search_centre(points_m: Array, pixels: Array, sensor: Sensor) -> CentreSearc
     found = minimize(cost, grid[best], method="Nelder-Mead", options=options)
     device = linear_step(points_m, pixels, found.x, sensor)
     before = costs[len(costs) // 2]
-    return CentreSearch(
-        device, before if np.isfinite(before) else np.nan, float(found.fun), len(points_m),
-        len(grid) + int(found.nfev),
-    )  # fmt: skip
+    before = before if np.isfinite(before) else np.nan
+    steps = len(grid) + int(found.nfev)
+    return CentreSearch(device, before, float(found.fun), len(points_m), steps)

@@ -22,7 +22,7 @@ _ROUNDS = 5
 
 
 class Sensor(NamedTuple):
-    """What is known of a device beforehand: (width, height) in pixels, pixel pitch in metres."""
+    """What is known of a device: (width, height) in pixels, pixel pitch in metres."""
 
     image_size: tuple[int, int]
     pixel_pitch_m: float
@@ -59,9 +59,14 @@ def linear_step(points_m: Array, pixels: Array, centre_px: Array, sensor: Sensor
     translation = np.array([*lateral, depth_m]) - rotation @ middle
     u, v = map(float, centre_px)
     return Device(
-        sensor.image_size, (focal_px, focal_px), (u, v), sensor.pixel_pitch_m,
-        rotation, translation, Division(kappa),
-    )  # fmt: skip
+        sensor.image_size,
+        (focal_px, focal_px),
+        (u, v),
+        sensor.pixel_pitch_m,
+        rotation,
+        translation,
+        Division(kappa),
+    )
 
 
 def _alignment(points: Array, offset: Array) -> tuple[Array, Array]:
@@ -114,5 +119,13 @@ def _focal(
 
 
 def cost_px2(device: Device, points_m: Array, pixels: Array) -> float:
-    """Return the paper's J: sum of squared distances of observed and mapped-back points, px^2."""
+    """Return the paper's J: sum of squared distances of observed and mapped-back points, px^2.
+
+    Parameters
+    ----------
+    device : Device
+        Maps the points back.
+    points_m, pixels : ndarray, (N, 3) and (N, 2)
+        World points, metres, and where they were observed.
+    """
     return float(np.sum((device.project(points_m) - pixels) ** 2))

@@ -98,9 +98,23 @@ class Volume(NamedTuple):
 def sigma_map(
     bundle: Bundle, volume: Volume, noise: EdgeNoise, shape: tuple[int, int, int] = (13, 10, 3)
 ) -> tuple[Array, Array]:
-    """Points (nz, ny, nx, 3) that span a volume, and their predicted 1-sigma, same shape, metres.
+    """Predict sigmas over a volume.
 
-    NaN where a device does not see a point.
+    Parameters
+    ----------
+    bundle : Bundle
+        A joint solution.
+    volume : Volume
+        Where.
+    noise : EdgeNoise
+        Noise of a single point.
+    shape : tuple of int
+        Number of points along x, y, z.
+
+    Returns
+    -------
+    points_m, sigma_m : ndarray, (nz, ny, nx, 3)
+        Points that span the volume, and their 1-sigma, metres; NaN where a device does not see one.
     """
     grid = volume.grid(shape)
     sigma = point_covariance(bundle, grid.reshape(-1, 3), noise).sigma_m

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_calibration.bundle.bundle_adjustment import Bundle, RigProblem, solve_bundle
+from sl_calibration.bundle.bundle_adjustment import Bundle, solve_bundle
 from sl_calibration.bundle.derivatives import meet
 from sl_calibration.bundle.outlier_rejection import fits_homography
 from sl_calibration.bundle.parameters import Freedom
+from sl_calibration.bundle.rig_problem import RigProblem
 from sl_calibration.bundle.stage_model import FAULTLESS
 from sl_calibration.data.solver_input import Holes, Targets
 from sl_calibration.solve.image_centre_search import CentreSearch, search_centre

@@ -8,7 +8,8 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_calibration.bundle.bundle_adjustment import Bundle, RigProblem, solve_bundle
+from sl_calibration.bundle.bundle_adjustment import Bundle, solve_bundle
+from sl_calibration.bundle.rig_problem import RigProblem
 from sl_calibration.data.solver_input import Holes
 from sl_calibration.solve.image_centre_search import search_centre
 from sl_calibration.solve.linear_step import Sensor, linear_step

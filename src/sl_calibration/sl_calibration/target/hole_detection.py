@@ -1,11 +1,13 @@
 """From an image to the plate's holes: spots, lattice, edges, identity, centres.
 
-1. `blobs`: dark elliptic spots.  2. `lattice`: those on a square lattice.  3. `placement`: which
-hole is which.  4. `hole_fit`: sub-pixel edges, also of holes that no spot was found for.
-5. `plate_map`: the centre of the circle from the centre of the ellipse; outliers.
+1. `blobs`: dark elliptic spots.  2. `lattice`: those on a square lattice.
+3. `hole_identification`: which hole is which.  4. `hole_fit`: sub-pixel edges, also of holes that
+no spot was found for.  5. `plate_map`: the circle's centre from the ellipse's; outliers.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -79,18 +81,22 @@ def find_plate(
     Without an origin mark the rotation by quarter turns is taken in which plate x is nearest to
     image right (plate y is then up).
     """
-    grey, full = _prepared(image, plate, saturation_dn)
-    blobs = find_blobs(grey)
-    enough = int(0.9 * plate.hole_count)
-    lattice = find_lattice(blobs, *_ratios(plate), enough)
+    seen = _prepared(image, plate, saturation_dn)
+    blobs = find_blobs(seen.image)
+    lattice = find_lattice(blobs, *_ratios(plate), enough=int(0.9 * plate.hole_count))
     _check_enough(plate, len(lattice), len(blobs.centres_px))
-    ids, start = _identified(plate, blobs, lattice, grey)
-    ids, fits = _measured(grey, plate, ids, start, full)
-    return _view(plate, ids, fits, (grey.shape[1], grey.shape[0]))
+    return _view(seen, *_measured(seen, *_identified(seen, blobs, lattice)))
 
 
-def _prepared(image: NDArray[np.generic], plate: Plate, full: float | None) -> tuple[Image, float]:
-    """Return the image as float32 with dark holes, and the level that counts as saturated."""
+class _Seen(NamedTuple):
+    """The image with dark holes (H, W), its plate, and the level that counts as saturated."""
+
+    image: Image
+    plate: Plate
+    full: float
+
+
+def _prepared(image: NDArray[np.generic], plate: Plate, full: float | None) -> _Seen:
     if image.ndim != 2 or min(image.shape) < 32:
         raise CalibrationError(f"image.shape={image.shape}; expected a grey image of 32 px or more")
     top = 255.0 if image.dtype == np.uint8 else np.inf
@@ -103,7 +109,9 @@ def _prepared(image: NDArray[np.generic], plate: Plate, full: float | None) -> t
             f"the image spans {low:.0f} to {high:.0f} DN; expected a lit plate with a range of at "
             f"least {MIN_RANGE * scale:.0f} DN (is the lamp off, or no plate with holes there?)"
         )
-    return (grey, top) if plate.dark_holes else (np.float32(grey.max()) - grey, np.inf)
+    if plate.dark_holes:
+        return _Seen(grey, plate, top)
+    return _Seen(np.float32(grey.max()) - grey, plate, np.inf)
 
 
 def _ratios(plate: Plate) -> tuple[float, float]:
@@ -121,14 +129,15 @@ def _check_enough(plate: Plate, holes: int, spots: int) -> None:
         )
 
 
-def _identified(plate: Plate, blobs: Blobs, lattice: Lattice, grey: Image) -> tuple[Ids, Blobs]:
+def _identified(seen: _Seen, blobs: Blobs, lattice: Lattice) -> tuple[Ids, Blobs]:
     """Number the holes: (column, row) and spots, in the same order."""
+    plate = seen.plate
     ij, spots = np.array(list(lattice)), np.array(list(lattice.values()))
     found = Blobs(blobs.centres_px[spots], blobs.shapes_px2[spots])
     h, _ = cv2.findHomography(ij.astype(np.float64), found.centres_px, cv2.LMEDS)
     margin = 1.2 * float(np.median(found.sizes_px)) * _ratios(plate)[1] + 2.0
     marks = _marks(plate, found, ij, np.asarray(h))
-    return place(plate, FoundLattice(ij, marks, np.asarray(h), grey, margin)).ids(ij), found
+    return place(plate, FoundLattice(ij, marks, np.asarray(h), seen.image, margin)).ids(ij), found
 
 
 def _marks(plate: Plate, found: Blobs, ij: Ids, lattice_to_image: Array) -> NDArray[np.bool_]:
@@ -141,23 +150,21 @@ def _marks(plate: Plate, found: Blobs, ij: Ids, lattice_to_image: Array) -> NDAr
     return np.asarray(ratio > 0.5)
 
 
-def _measured(
-    grey: Image, plate: Plate, ids: Ids, start: Blobs, full: float
-) -> tuple[Ids, HoleFits]:
+def _measured(seen: _Seen, ids: Ids, start: Blobs) -> tuple[Ids, HoleFits]:
     """Fit the edges of the holes that were found, then of those that should be there too."""
-    xy = plate.xy_m(ids)
+    plate = seen.plate
     if plate.chamfer_m:
-        start = Blobs(start.centres_px, _nominal_shapes(plate, ids, start))
-    fits = _fitted(grey, plate, ids, start, full)
+        # a spot may be as large as its chamfer's upper rim: start from the holes' bottoms
+        everywhere = np.ones(len(ids), dtype=bool)
+        rough, _ = fit_map(plate, ids, start.centres_px, ROUGH_SIGMA_PX, everywhere)
+        start = Blobs(start.centres_px, _circles(plate, rough, ids).spots.shapes_px2)
+    fits = _fitted(seen, ids, start)
     use = np.isfinite(fits.centres_px[:, 0])
     _check_enough(plate, int(use.sum()), len(ids))
-    sigma = np.full(len(ids), ROUGH_SIGMA_PX)
-    rough, _ = fit_map(plate, xy, fits.centres_px, sigma, use & ~_poor(fits))
-    more = _unseen(plate, ids[use], rough, (grey.shape[1], grey.shape[0]))
+    rough, _ = fit_map(plate, ids, fits.centres_px, ROUGH_SIGMA_PX, use & ~_poor(fits))
+    more = _unseen(seen, ids[use], rough)
     if len(more):
-        local = map_circles(rough, plate.xy_m(more), plate.radius_m(more))
-        spots = Blobs(local.centres_px, _shapes(local, plate, more))
-        extra = _fitted(grey, plate, more, spots, full)
+        extra = _fitted(seen, more, _circles(plate, rough, more).spots)
         fits = HoleFits(*(np.concatenate(pair) for pair in zip(fits, extra, strict=True)))
         # a place that no spot was seen at and that has no clean edge is no hole
         clean = np.arange(len(fits.misfit)) < len(ids)
@@ -166,53 +173,46 @@ def _measured(
     return ids[use], HoleFits(*(field[use] for field in fits))
 
 
-def _fitted(grey: Image, plate: Plate, ids: Ids, start: Blobs, full: float) -> HoleFits:
-    step = start.sizes_px * plate.pitch_m / plate.radius_m(ids)
+def _circles(plate: Plate, seen: PlateMap, ids: Ids) -> LocalMap:
+    return map_circles(seen, plate.xy_m(ids), plate.radius_m(ids))
+
+
+def _fitted(seen: _Seen, ids: Ids, start: Blobs) -> HoleFits:
+    plate, radius = seen.plate, seen.plate.radius_m(ids)
+    step = start.sizes_px * plate.pitch_m / radius
     gap = step * (1 - (plate.diameter_m + 2 * plate.chamfer_m) / plate.pitch_m)
-    resolved = start.sizes_px * plate.chamfer_m / plate.radius_m(ids) > MIN_CHAMFER_PX
-    rim = 1 + np.where(resolved, plate.chamfer_m / plate.radius_m(ids), 0.0)
-    return fit_holes(grey, start, gap, rim, full)
+    resolved = start.sizes_px * plate.chamfer_m / radius > MIN_CHAMFER_PX
+    rim = 1 + np.where(resolved, plate.chamfer_m / radius, 0.0)
+    return fit_holes(seen.image, start, gap, rim, seen.full)
 
 
-def _nominal_shapes(plate: Plate, ids: Ids, start: Blobs) -> Array:
-    """Ellipses of the holes' bottoms: a spot may be as large as its chamfer's upper rim."""
-    everywhere = np.ones(len(ids), dtype=bool)
-    sigma = np.full(len(ids), ROUGH_SIGMA_PX)
-    rough, _ = fit_map(plate, plate.xy_m(ids), start.centres_px, sigma, everywhere)
-    return _shapes(map_circles(rough, plate.xy_m(ids), plate.radius_m(ids)), plate, ids)
-
-
-def _unseen(plate: Plate, ids: Ids, rough: PlateMap, size: tuple[int, int]) -> Ids:
+def _unseen(seen: _Seen, ids: Ids, rough: PlateMap) -> Ids:
     """Holes that are not among ``ids`` but should lie in the image, (M, 2)."""
-    known = {tuple(k) for k in ids.tolist()}
+    plate, known = seen.plate, {tuple(k) for k in ids.tolist()}
     whole = [(c, r) for r in range(plate.rows) for c in range(plate.columns)]
     rest = np.array([k for k in whole if k not in known], dtype=np.int64).reshape(-1, 2)
     if len(rest) == 0:
         return rest
-    local = map_circles(rough, plate.xy_m(rest), plate.radius_m(rest))
-    reach = np.linalg.norm(local.jacobian_px_per_m, axis=2) * plate.radius_m(rest)[:, None] + 3.0
-    q = local.centres_px
-    return np.asarray(rest[np.all((q > reach) & (q < np.array(size) - 1 - reach), axis=1)])
+    local = _circles(plate, rough, rest)
+    reach = np.linalg.norm(local.jacobian_px_per_m, axis=2) * local.radius_m[:, None] + 3.0
+    q, last = local.centres_px, np.array(seen.image.shape[::-1]) - 1
+    return np.asarray(rest[np.all((q > reach) & (q < last - reach), axis=1)])
 
 
-def _shapes(local: LocalMap, plate: Plate, ids: Ids) -> Array:
-    a = local.jacobian_px_per_m * plate.radius_m(ids)[:, None, None]
-    return np.asarray(a @ np.swapaxes(a, 1, 2))
-
-
-def _view(plate: Plate, ids: Ids, fits: HoleFits, size: tuple[int, int]) -> PlateView:
+def _view(seen: _Seen, ids: Ids, fits: HoleFits) -> PlateView:
     """Turn fits into centres of circles, with their flags."""
+    plate, poor = seen.plate, _poor(fits)
     covariance = _covariance(fits)
     sigma = np.sqrt(0.5 * np.trace(covariance, axis1=1, axis2=2))
-    xy, radius, poor = plate.xy_m(ids), plate.radius_m(ids), _poor(fits)
-    seen, _ = fit_map(plate, xy, fits.centres_px, sigma, ~poor)
-    bias = map_circles(seen, xy, radius).bias_px
-    seen, z = fit_map(plate, xy, fits.centres_px - bias, sigma, ~poor)
-    poor |= _odd_size(fits, map_circles(seen, xy, radius), radius)
+    found, _ = fit_map(plate, ids, fits.centres_px, sigma, ~poor)
+    bias = _circles(plate, found, ids).bias_px
+    centres = fits.centres_px - bias
+    found, z = fit_map(plate, ids, centres, sigma, ~poor)
+    poor |= _odd_size(fits, _circles(plate, found, ids))
     flags = HoleFlag.POOR_EDGE * poor + HoleFlag.OUTLIER * (z > OUTLIER_SIGMAS)
     flags = (flags + HoleFlag.SATURATED * (fits.saturated > MIN_SATURATED)).astype(np.uint8)
-    centres, missing = fits.centres_px - bias, _unseen(plate, ids, seen, size)
-    view = PlateView(ids, xy, centres, sigma, covariance, flags, missing, bias_px=bias)
+    missing = _unseen(seen, ids, found)
+    view = PlateView(ids, plate.xy_m(ids), centres, sigma, covariance, flags, missing, bias)
     return view.taken(np.lexsort((ids[:, 0], ids[:, 1])))
 
 
@@ -231,8 +231,8 @@ def _poor(fits: HoleFits) -> NDArray[np.bool_]:
     return np.asarray(rough | faint | blurred | ~np.isfinite(fits.misfit))
 
 
-def _odd_size(fits: HoleFits, local: LocalMap, radius_m: Array) -> NDArray[np.bool_]:
+def _odd_size(fits: HoleFits, local: LocalMap) -> NDArray[np.bool_]:
     """Holes whose size, beside the plate's local scale, is not that of the others."""
-    scale = np.sqrt(np.abs(np.linalg.det(local.jacobian_px_per_m))) * radius_m
+    scale = np.sqrt(np.abs(np.linalg.det(local.jacobian_px_per_m))) * local.radius_m
     ratio = np.log(np.linalg.det(fits.shapes_px2) ** 0.25 / scale)
     return np.asarray(np.abs(ratio - np.median(ratio)) > np.log(SIZE_FACTOR))

@@ -25,9 +25,8 @@ MIN_LIT = 0.3
 #: Turning the plate over must explain this many holes more than leaving it.
 SIDE_MARGIN = 2
 
-_ROTATIONS = [
-    np.array([[c, -s], [s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))
-]  # fmt: skip
+_QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+_ROTATIONS = [np.array([[c, -s], [s, c]]) for c, s in _QUARTERS]
 _DIAGONALS = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, 0.5], [-0.5, -0.5]])
 _MIRROR = np.diag([1, -1])
 
@@ -72,19 +71,21 @@ class FoundLattice:
 
     def pixels(self, ij: Array | Ids) -> Array:
         """Image points (N, 2) of lattice points (N, 2)."""
-        local = ij @ self.lattice_to_image[:, :2].T + self.lattice_to_image[:, 2]
+        local = self._local(ij)
         return np.asarray(local[..., :2] / local[..., 2:])
+
+    def _local(self, ij: Array | Ids) -> Array:
+        """Homogeneous pixels (N, 3)."""
+        return np.asarray(ij @ self.lattice_to_image[:, :2].T + self.lattice_to_image[:, 2])
 
     def in_view(self, ij: Ids) -> NDArray[np.bool_]:
         """Whether holes at lattice points (N, 2) lie wholly in the image, in lit plate."""
-        local = ij @ self.lattice_to_image[:, :2].T + self.lattice_to_image[:, 2]
         last = np.array(self.image.shape[::-1]) - 1 - self.margin_px
         q = self.pixels(ij)
         inside = np.all((q > self.margin_px) & (q < last), axis=-1)
-        inside &= local[..., 2] * self.lattice_to_image[2, 2] > 0
-        return np.asarray(
-            inside & (self._surround(ij) > MIN_LIT * np.median(self._surround(self.ij)))
-        )
+        inside &= self._local(ij)[..., 2] * self.lattice_to_image[2, 2] > 0
+        lit = self._surround(ij) > MIN_LIT * np.median(self._surround(self.ij))
+        return np.asarray(inside & lit)
 
     def _surround(self, ij: Ids) -> Array:
         """Lowest level (N,) half-way to the four diagonal neighbours; inf where none is in view."""
@@ -100,6 +101,15 @@ class FoundLattice:
 def place(plate: Plate, found: FoundLattice) -> Placement:
     """Lay the plate on the lattice.
 
+    Parameters
+    ----------
+    plate : Plate
+        The plate.
+    found : FoundLattice
+        What is seen of it.
+
+    Notes
+    -----
     Without a mark, of the rotations that explain the image equally well the one is taken whose
     plate x is nearest to image right. A corner mark on a plate with as many columns as rows leaves
     the side in doubt; the front is taken.
@@ -110,8 +120,7 @@ def place(plate: Plate, found: FoundLattice) -> Placement:
         When the lattice does not fit on the plate, more than one offset (with a mark: or rotation)
         explains it equally well, or the plate shows its back.
     """
-    options = [option for turn, mirrored in _turns(found) for option in _shifts(plate, found, turn,
-               mirrored)]  # fmt: skip
+    options = [option for turn in _turns(found) for option in _shifts(plate, found, *turn)]
     if not options:
         extent = np.ptp(found.ij, axis=0) + 1
         raise CalibrationError(

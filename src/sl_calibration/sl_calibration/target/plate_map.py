@@ -1,21 +1,22 @@
 """From the plate to the image without a camera model: a homography and a smooth rest.
 
 The rest (a polynomial in the plate's coordinates, of the order that the number of holes carries)
-takes up what the lens does. It serves two ends: holes off the map are
-outliers, and its local shape tells by how much the centre of a circle's image misses the image of
-the circle's centre.
+takes up what the lens does. Holes off the map are outliers, and its local shape tells by how much
+the centre of a circle's image misses the image of the circle's centre.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_calibration.target.plate import Plate
+from sl_calibration.target.blobs import Blobs
+from sl_calibration.target.plate import Ids, Plate
 
 Array = NDArray[np.float64]
 
@@ -67,21 +68,19 @@ def _powers(xy: Array, order: int) -> Array:
     return np.stack(terms, axis=-1)
 
 
-def _plain(homography: Array, scale_m: float) -> PlateMap:
-    return PlateMap(homography, np.zeros((1, 2)), scale_m)
-
-
 def fit_map(
-    plate: Plate, xy_m: Array, q_px: Array, sigma_px: Array, trusted: NDArray[np.bool_]
+    plate: Plate, ids: Ids, q_px: Array, sigma_px: Array | float, trusted: NDArray[np.bool_]
 ) -> tuple[PlateMap, Array]:
     """Fit the map robustly.
 
     Parameters
     ----------
     plate : Plate
-        Gives the extent.
-    xy_m, q_px, sigma_px : ndarray, (N, 2), (N, 2), (N,)
-        Holes on the plate and their centres in the image.
+        The plate.
+    ids, q_px : ndarray, (N, 2)
+        Holes (column, row) and their centres in the image, pixels.
+    sigma_px : float or ndarray, (N,)
+        1-sigma of these: a hole nearer to the map is no outlier.
     trusted : ndarray, (N,) bool
         Those that may shape the map; at least 4.
 
@@ -92,9 +91,10 @@ def fit_map(
         Distance of each hole from the map over its robust sigma.
     """
     scale = 0.5 * plate.pitch_m * max(plate.columns, plate.rows)
+    xy_m = plate.xy_m(ids)
     xy = xy_m / scale
     first, _ = cv2.findHomography(xy[trusted], q_px[trusted], cv2.LMEDS)
-    found = _plain(np.eye(3) if first is None else np.asarray(first, dtype=np.float64), scale)
+    found = PlateMap(np.eye(3) if first is None else np.asarray(first), np.zeros((1, 2)), scale)
     for limit in LIMITS:
         off = np.linalg.norm(q_px - found(xy_m), axis=1)
         # |off| of a clean hole is Rayleigh distributed: median 1.18 sigma
@@ -108,10 +108,10 @@ def fit_map(
 
 def _fitted(xy: Array, q_px: Array, scale_m: float) -> PlateMap:
     homography, _ = cv2.findHomography(xy, q_px, 0)
-    plain = _plain(np.asarray(homography, dtype=np.float64), scale_m)
+    plain = PlateMap(np.asarray(homography), np.zeros((1, 2)), scale_m)
     order = next(order for least, order in ORDERS if len(xy) >= least)
     rest, *_ = np.linalg.lstsq(_powers(xy, order), q_px - plain(xy * scale_m), rcond=None)
-    return PlateMap(plain.homography, np.asarray(rest, dtype=np.float64), scale_m)
+    return replace(plain, rest_px=np.asarray(rest))
 
 
 @dataclass(frozen=True)
@@ -126,14 +126,23 @@ class LocalMap:
         Centres of the ellipses fitted to the images of the circles, minus ``centres_px``.
     jacobian_px_per_m : ndarray, (N, 2, 2)
         Of the map at the centres.
+    radius_m : ndarray, (N,)
+        Of the circles.
     """
 
     centres_px: Array
     bias_px: Array
     jacobian_px_per_m: Array
+    radius_m: Array
+
+    @property
+    def spots(self) -> Blobs:
+        """The circles' images as ellipses."""
+        a = self.jacobian_px_per_m * self.radius_m[:, None, None]
+        return Blobs(self.centres_px, np.asarray(a @ np.swapaxes(a, 1, 2)))
 
 
-def map_circles(project: object, xy_m: Array, radius_m: Array) -> LocalMap:
+def map_circles(project: Callable[[Array], Array], xy_m: Array, radius_m: Array) -> LocalMap:
     """Send circles through any smooth map of the plate to the image.
 
     A circle's image, seen in the frame where it is a circle to first order, deviates from it by a
@@ -149,11 +158,11 @@ def map_circles(project: object, xy_m: Array, radius_m: Array) -> LocalMap:
     """
     angle = np.arange(CIRCLE_POINTS) * (2 * np.pi / CIRCLE_POINTS)
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    centres = project(xy_m)  # type: ignore[operator]
-    rim = project(xy_m[:, None] + radius_m[:, None, None] * unit)  # type: ignore[operator]
+    centres = project(xy_m)
+    rim = project(xy_m[:, None] + radius_m[:, None, None] * unit)
     affine = 2 / CIRCLE_POINTS * np.einsum("nki,kj->nij", rim, unit)  # per radius
     local = np.linalg.solve(affine[:, None], (rim - centres[:, None])[..., None])[..., 0]
     radial = np.sum((local - unit) * unit, axis=-1)
     shift = 2 / CIRCLE_POINTS * radial @ unit
     bias = np.einsum("nij,nj->ni", affine, shift)
-    return LocalMap(centres, bias, affine / radius_m[:, None, None])
+    return LocalMap(centres, bias, affine / radius_m[:, None, None], radius_m)
