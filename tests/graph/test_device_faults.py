@@ -142,7 +142,7 @@ def test_a_fault_that_can_be_borne_never_makes_a_wrong_stack(cell: Cell, case: C
 
 
 def test_a_saturated_frame_is_matched_as_it_is(cell: Cell) -> None:
-    """The stack holds what the camera saw; the reconstruction refuses it (`test_nodes.py`)."""
+    """The stack holds what the camera saw; reconstruction refuses it (`test_scan_graph.py`)."""
     verdict = None
     while verdict is None or verdict.status != MatchedFrame.STACK_COMPLETE:
         cell.camera.faults = CameraFaults(at={"saturate": [3]})
