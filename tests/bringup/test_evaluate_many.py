@@ -17,8 +17,10 @@ from sl_bringup.evaluation.sweep import variants
 from sl_common.errors import ConfigError
 from sl_common.topics import REPORT, SETTINGS
 from sl_reconstruct.decode.settings import Settings
+from sl_reconstruct.messages import report_to_msg
 from sl_reconstruct.model.calibration_file import Calibration, save_calibration
 from sl_reconstruct.model.rig import Rig
+from sl_reconstruct.scan.scan_summary import ScanSummary
 from support.tiny_scans import render, tiny_rig, tiny_sequence
 
 START_NS = 1_700_000_000_000_000_000
@@ -65,12 +67,9 @@ def summary(folder: Path) -> dict:
 
 
 def live_report(scan_id: int, cloud_hash: str, settings_hash: str, calibration_hash: str) -> object:
-    return make_message(REPORT.msgtype,
-        scan_id=scan_id, sequence="precise", attempts=1, attempt_messages=[], rows=0, columns=0,
-        points=0, lit_positions=0, refused=[], median_sigma_m=0.0, edge_sigma_px=0.0,
-        edge_bound_px=0.0, edge_blur_px=0.0, acquisition_s=0.0, processing_s=0.0,
-        calibration_hash=calibration_hash, settings_hash=settings_hash, cloud_hash=cloud_hash,
-    )  # fmt: skip
+    hashes = {"cloud_hash": cloud_hash, "settings_hash": settings_hash}
+    summary = ScanSummary(scan_id, "precise", calibration_hash=calibration_hash, **hashes)
+    return report_to_msg(summary, make_message)
 
 
 def test_threads_change_nothing(tmp_path: Path, stacks: list[np.ndarray]) -> None:

@@ -40,8 +40,8 @@ ROOMS = {
         "stage.zaber": {"stage"}, "sync": set(),
     },
     "sl_reconstruct": {
-        "model": set(), "cloud": set(), "scan": set(), "decode": {"cloud"}, "measure": {"cloud"},
-        "reconstruction": {"model", "cloud", "decode"},
+        "model": set(), "cloud": set(), "decode": {"cloud"}, "measure": {"cloud"},
+        "reconstruction": {"model", "cloud", "decode"}, "scan": {"cloud", "reconstruction"},
     },
     "sl_calibration": {
         "target": set(), "data": {"target"}, "bundle": {"data"}, "solve": {"data", "bundle"},

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image, PointCloud2
 from sl_interfaces.action import Scan
-from sl_interfaces.msg import ScanReport
 
 from sl_bringup.cli.main import parse
 from sl_bringup.cli.up import graph_options
@@ -21,7 +20,7 @@ from sl_bringup.client_node import CONNECT_S, GraphClient, run_client
 from sl_bringup.graph.console import complain, say
 from sl_bringup.results.live_scan import check_cloud, live_report, summary, write_result
 from sl_common import topics
-from sl_reconstruct.messages import cloud_from_msg, refusals_from_msg
+from sl_reconstruct.messages import cloud_from_msg, refusals_from_msg, report_from_msg
 
 #: The cloud is sent before the action's result; it may still be later by so long.
 CLOUD_WAIT_S = 10.0
@@ -91,14 +90,6 @@ class ScanClient(GraphClient):
         self.show(line, f", {told.frames}/{told.count} frames {told.progress:4.0%}")
 
 
-def fields_of(report: ScanReport) -> dict[str, Any]:
-    """Fields of a report by name, plain values."""
-    values = {name: getattr(report, name) for name in report.get_fields_and_field_types()}
-    values["refused"] = {item.reason: item.count for item in report.refused}
-    values["attempt_messages"] = list(report.attempt_messages)
-    return values
-
-
 def _deliver(
     args: argparse.Namespace,
     result: Any,
@@ -106,7 +97,7 @@ def _deliver(
     refusals: NDArray[np.uint8] | None,
 ) -> int:
     """Write and tell what came; the exit status."""
-    report = live_report(fields_of(result.report), result.success, result.message)
+    report = live_report(report_from_msg(result.report), result.success, result.message)
     points = None if cloud is None or not result.success else cloud_from_msg(cloud)
     fault = check_cloud(points, report) if points is not None else ""
     if result.success and points is None:

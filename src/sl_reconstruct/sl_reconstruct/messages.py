@@ -24,15 +24,20 @@ from sl_common.topics import (
     WORLD_FRAME,
 )
 from sl_projector.sequence.messages import flat_bytes, rigid_to_msg
-from sl_projector.sequence.stack import Stack
-from sl_reconstruct.cloud.cloud_writer import cloud_hash
 from sl_reconstruct.model.calibration_file import Calibration, dump_calibration
 from sl_reconstruct.model.opencv_lens import plumb_bob
 from sl_reconstruct.model.rig import Device, Rig
-from sl_reconstruct.reconstruction.reconstructor_cache import Product
+from sl_reconstruct.scan.scan_summary import ScanSummary
 
 #: sensor_msgs/PointField's numbers for types.
 _FLOAT32, _FLOAT64 = 7, 8
+#: Quality figures that a report's message has.
+EDGE_FIGURES = ("edge_sigma_px", "edge_bound_px", "edge_blur_px")
+#: Fields of a report's message that a summary has under the same name, always.
+_REPORT_FIELDS = (
+    *("scan_id", "sequence", "rows", "columns", "points", "lit_positions", "median_sigma_m"),
+    *("calibration_hash", "settings_hash", "cloud_hash"),
+)
 
 
 def cloud_to_msg(points: NDArray[Any], stamp_ns: int) -> Any:
@@ -81,30 +86,43 @@ def refusals_from_msg(message: Any) -> NDArray[np.uint8]:
     return codes.reshape(message.height, message.width)
 
 
-def report_to_msg(product: Product, stack: Stack) -> Any:
-    """Say what a stack gave: counts, figures and hashes (times and attempts are the node's)."""
-    cloud = product.cloud
-    rows, columns = cloud.points.shape
-    return ros_message(
+def report_to_msg(summary: ScanSummary, make: MakeMessage = ros_message) -> Any:
+    """Make a ``sl_interfaces/ScanReport``; what is not known is zero in it.
+
+    Parameters
+    ----------
+    summary : ScanSummary
+        The scan.
+    make : MakeMessage
+        Where messages come from.
+    """
+    refused = [
+        make("sl_interfaces/msg/RefusalCount", reason=reason, count=count)
+        for reason, count in sorted(summary.refused.items())
+    ]
+    return make(
         REPORT.msgtype,
-        scan_id=stack.scan_id,
-        sequence=stack.sequence.name,
-        attempts=1,
-        rows=rows,
-        columns=columns,
-        points=cloud.present,
-        lit_positions=cloud.lit,
-        refused=[
-            ros_message("sl_interfaces/msg/RefusalCount", reason=reason, count=count)
-            for reason, count in sorted(cloud.refused.items())
-        ],
-        median_sigma_m=cloud.median_sigma_m,
-        edge_sigma_px=cloud.figures.edge_sigma_px,
-        edge_bound_px=cloud.figures.edge_bound_px,
-        edge_blur_px=cloud.figures.edge_blur_px,
-        calibration_hash=product.calibration_hash,
-        settings_hash=product.settings_hash,
-        cloud_hash=cloud_hash(cloud.points),
+        **{name: getattr(summary, name) for name in _REPORT_FIELDS},
+        **{name: summary.figures.get(name, 0.0) for name in EDGE_FIGURES},
+        refused=refused,
+        attempts=summary.attempts or 0,
+        attempt_messages=list(summary.attempt_messages or ()),
+        acquisition_s=summary.acquisition_s or 0.0,
+        processing_s=summary.processing_s or 0.0,
+    )
+
+
+def report_from_msg(message: Any) -> ScanSummary:
+    """Read a ``sl_interfaces/ScanReport``."""
+    figures = {name: getattr(message, name) for name in EDGE_FIGURES}
+    if message.edge_bound_px > 0:
+        figures["bound_ratio"] = message.edge_sigma_px / message.edge_bound_px
+    live = ("attempts", "acquisition_s", "processing_s")
+    return ScanSummary(
+        **{name: getattr(message, name) for name in (*_REPORT_FIELDS, *live)},
+        refused={item.reason: item.count for item in message.refused},
+        figures=figures,
+        attempt_messages=tuple(message.attempt_messages),
     )
 
 

@@ -12,10 +12,10 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from typing import Any
 
-from sl_interfaces.msg import PatternStack, ScanReport
+from sl_interfaces.msg import PatternStack
 
 from sl_common import topics
 from sl_common.base_node import Health, RigNode, Task, run
@@ -40,6 +40,7 @@ from sl_reconstruct.scan.scan_flow import (
     ScanResult,
     ScanTimeouts,
 )
+from sl_reconstruct.scan.scan_summary import ScanSummary
 from sl_reconstruct.scan.stack_client import StackClient
 
 try:
@@ -228,7 +229,7 @@ class ReconstructNode(RigNode):
         """Reconstruct, publish, report; runs in the worker's thread."""
         stack, came_ns = self._stacks.popleft()
         try:
-            report = self._reconstruct(stack, came_ns)
+            summary = self._reconstruct(stack, came_ns)
         except SlError as error:
             self.complain(topics.STACK.name, error)
             self._last = f"scan {stack.scan_id}: {error}"
@@ -237,12 +238,12 @@ class ReconstructNode(RigNode):
             self.complain(topics.STACK.name, error)
             self._finish(stack.scan_id, StackError(f"internal fault: {error!r}"))
         else:
-            self._last = f"scan {stack.scan_id}: {report.points} points"
-            self._finish(stack.scan_id, report)
+            self._last = f"scan {stack.scan_id}: {summary.points} points"
+            self._finish(stack.scan_id, summary)
         finally:
             self._waiting.release()
 
-    def _reconstruct(self, stack: Stack, came_ns: int) -> ScanReport:
+    def _reconstruct(self, stack: Stack, came_ns: int) -> ScanSummary:
         if not self._workshop.calibration_hash:
             raise CalibrationError(self._calibration_fault or NO_CALIBRATION)
         began_s = time.perf_counter()
@@ -257,15 +258,19 @@ class ReconstructNode(RigNode):
         self._clouds.publish(cloud_to_msg(product.cloud.points, stamp_ns))
         self._measuring.remember(product.cloud.points, stamp_ns)
         done_ns = time.time_ns()
-        report = report_to_msg(product, stack)
-        report.processing_s = (done_ns - came_ns) * 1e-9
-        report.acquisition_s = max(0.0, (came_ns - stamp_ns) * 1e-9)
-        self._reports.publish(report)
+        summary = ScanSummary.of(
+            product,
+            stack,
+            attempts=1,
+            acquisition_s=max(0.0, (came_ns - stamp_ns) * 1e-9),
+            processing_s=(done_ns - came_ns) * 1e-9,
+        )
+        self._reports.publish(report_to_msg(summary))
         self.get_logger().info(
-            f"scan {stack.scan_id}: {report.points} points {report.processing_s:.3f} s after the "
+            f"scan {stack.scan_id}: {summary.points} points {summary.processing_s:.3f} s after the "
             f"last image, {computed_s:.3f} s of it reconstruction"
         )
-        return report
+        return summary
 
     # -- scans --------------------------------------------------------------------------------
 
@@ -294,14 +299,17 @@ class ReconstructNode(RigNode):
 
     def _fill(self, response: Any, result: ScanResult) -> Any:
         """Put a result into a service's response or an action's result."""
-        report = result.report or ScanReport(scan_id=result.scan_id)
-        report.attempt_messages = result.attempt_messages
-        report.attempts = len(result.attempt_messages) + (1 if result.scan_id else 0)
-        response.success, response.message, response.report = result.success, result.message, report
+        summary = replace(
+            result.report or ScanSummary(result.scan_id),
+            attempts=len(result.attempt_messages) + (1 if result.scan_id else 0),
+            attempt_messages=tuple(result.attempt_messages),
+        )
+        response.success, response.message = result.success, result.message
+        response.report = report_to_msg(summary)
         if result.success:
             response.message = (
-                f"{report.points} points of {report.lit_positions} lit positions, "
-                f"median sigma {report.median_sigma_m * 1e6:.2f} um"
+                f"{summary.points} points of {summary.lit_positions} lit positions, "
+                f"median sigma {summary.median_sigma_m * 1e6:.2f} um"
             )
         else:
             self.get_logger().error(f"scan failed: {result.message}")

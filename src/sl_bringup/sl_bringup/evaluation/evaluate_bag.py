@@ -11,7 +11,7 @@ import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,12 +31,12 @@ from sl_common.errors import BagError, CalibrationError, SlError
 from sl_common.json_file import write_json
 from sl_common.topics import TRIGGER
 from sl_projector.sequence.stack import Stack
-from sl_reconstruct.cloud.cloud import Cloud, median
-from sl_reconstruct.cloud.cloud_writer import cloud_hash
+from sl_reconstruct.cloud.cloud import Cloud
 from sl_reconstruct.decode.full_scale import saturation_of
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.reconstruction.reconstructor_cache import Workshop
 from sl_reconstruct.reconstruction.scan_quality import verdict
+from sl_reconstruct.scan.scan_summary import ScanSummary
 
 VERDICTS = (Status.STACK_COMPLETE, Status.STACK_REFUSED)
 #: Workshops kept with their scratch memory, where calibrations change.
@@ -252,10 +252,11 @@ class _BagRun:
         notes = in_force.mismatch, _guessed(stack, settings, report["saturation_dn"])
         report["notes"] = [note for note in notes if note]
         workshop = self._workshops.of(in_force, settings)
-        cloud = workshop(stack.images, stack.sequence, report["saturation_dn"]).cloud
-        report.update(_result(cloud))
+        product = workshop(stack.images, stack.sequence, report["saturation_dn"])
+        good, reasons = verdict(product.cloud)
+        report.update(ScanSummary.of(product, stack).to_dict(), good=good, reasons=reasons)
         report["live"] = self._live.compare(report)
-        return cloud
+        return product.cloud
 
     def _write(
         self, folder: Path, report: Report, cloud: Cloud | None, stack: Stack | None,
@@ -321,31 +322,6 @@ def _guessed(stack: Stack, settings: Settings, saturation_dn: int) -> str:
         "nothing says how many of the 16 bits the camera used; as the values show, pixels count "
         f"as saturated from {saturation_dn} DN on (--set saturation_dn=N says otherwise)"
     )
-
-
-def _result(cloud: Cloud) -> Report:
-    good, reasons = verdict(cloud)
-    return {
-        "good": good,
-        "reasons": reasons,
-        "cloud_hash": cloud_hash(cloud.points),
-        "points": cloud.present,
-        "lit_positions": cloud.lit,
-        "present_fraction": cloud.present / cloud.lit if cloud.lit else 0.0,
-        "refused": dict(cloud.refused),
-        "figures": _figures(cloud),
-        "median_sigma_m": cloud.median_sigma_m,
-    }
-
-
-def _figures(cloud: Cloud) -> dict[str, float]:
-    """All quality figures by name, the residuals of the rays where there are any."""
-    figures = {f.name: getattr(cloud.figures, f.name) for f in fields(cloud.figures)}
-    figures["bound_ratio"] = cloud.figures.bound_ratio
-    for name in ("gap_m", "gap_px"):
-        if (gap := getattr(cloud, name)) is not None:
-            figures[f"median_{name}"] = median(gap)
-    return figures
 
 
 def is_good(reports: Sequence[Mapping[str, Any]]) -> bool:

@@ -8,6 +8,8 @@ from typing import Any
 
 from sl_bringup.bag.bags import Bag
 from sl_common.topics import REPORT
+from sl_reconstruct.messages import report_from_msg
+from sl_reconstruct.scan.scan_summary import ScanSummary
 
 
 class LiveResults:
@@ -20,15 +22,16 @@ class LiveResults:
     """
 
     def __init__(self, bag: Bag) -> None:
-        self._reports: defaultdict[int, list[Any]] = defaultdict(list)
+        self._reports: defaultdict[int, list[ScanSummary]] = defaultdict(list)
         if bag.has(REPORT):
             for recorded in bag.messages(REPORT, quick=True):
-                self._reports[recorded.message.scan_id].append(recorded.message)
+                summary = report_from_msg(recorded.message)
+                self._reports[summary.scan_id].append(summary)
 
     def settings_hash(self, scan_id: int) -> str:
         """Settings of the scan's live cloud; empty where there is none."""
         live = self._reports.get(scan_id, [])
-        return str(live[-1].settings_hash) if live else ""
+        return live[-1].settings_hash if live else ""
 
     def compare(self, report: Mapping[str, Any]) -> dict[str, Any]:
         """Compare a scan's report with the live one.
@@ -41,10 +44,9 @@ class LiveResults:
         live = self._reports.get(report["scan_id"], [])
         if not live:
             return {"agrees": None, "told": "the recording holds no live result of this scan"}
-        for message in live:
-            if message.cloud_hash == report["cloud_hash"]:
-                return {"agrees": True, "told": "the live cloud has the same hash",
-                        "cloud_hash": message.cloud_hash}  # fmt: skip
+        if (same := report["cloud_hash"]) in [summary.cloud_hash for summary in live]:
+            told = "the live cloud has the same hash"
+            return {"agrees": True, "told": told, "cloud_hash": same}
         last = live[-1]
         found: dict[str, Any] = {"agrees": None, "cloud_hash": last.cloud_hash}
         for what, told in (("calibration", "another calibration"), ("settings", "other settings")):

@@ -21,36 +21,30 @@ from sl_reconstruct.cloud.cloud_writer import cloud_hash
 from sl_reconstruct.cloud.refusals import Reason
 from sl_reconstruct.measure.groove import measure_groove
 from sl_reconstruct.measure.plane_angle import AngleMeasurement
+from sl_reconstruct.scan.scan_summary import ScanSummary
 
 MEASURES = ("groove",)
 
 
-def live_report(answer: Mapping[str, Any], success: bool, message: str) -> dict[str, Any]:
-    """Report of a scan, from the fields of the action's `ScanReport`.
+def live_report(summary: ScanSummary, success: bool, message: str) -> dict[str, Any]:
+    """Report of a live scan.
 
     Parameters
     ----------
-    answer : mapping
-        Fields of the message by name; ``refused`` as counts by reason.
+    summary : ScanSummary
+        What the action's result says.
     success : bool
         Whether there is a cloud.
     message : str
         What the graph said about it.
     """
-    lit = answer["lit_positions"]
-    keys = ("edge_sigma_px", "edge_bound_px", "edge_blur_px")
-    figures = {key: answer[key] for key in keys}
-    if answer["edge_bound_px"] > 0:
-        figures["bound_ratio"] = answer["edge_sigma_px"] / answer["edge_bound_px"]
     return {
         "format": 1,
         "bag": "live",
         "good": success,
         "reasons": [] if success else [message],
         "message": message,
-        **{key: value for key, value in answer.items() if key not in keys},
-        "present_fraction": answer["points"] / lit if lit else 0.0,
-        "figures": figures,
+        **summary.to_dict(),
         "software": software_version(),
     }
 
