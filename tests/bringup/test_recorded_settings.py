@@ -15,7 +15,7 @@ from sl_bringup.bag.bags import make_message
 from sl_camera.sync.match_events import MatcherSettings
 from sl_common.errors import ConfigError
 from sl_common.topics import CAMERA_SETTINGS, MATCHING, REPORT, SETTINGS, Topic
-from sl_reconstruct.decode import full_scale
+from sl_reconstruct.decode import stack_statistics
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.model.calibration_file import Calibration
 from support.tiny_scans import render, tiny_rig, tiny_sequence
@@ -124,8 +124,8 @@ def test_twelve_bits_need_no_setting(
 ) -> None:  # fmt: skip
     """The camera's settings say where its pixels end; without them the values do, aloud."""
     looked: list[int] = []
-    look = full_scale.full_scale_dn
-    monkeypatch.setattr(full_scale, "full_scale_dn", lambda s: looked.append(1) or look(s))
+    look = stack_statistics.full_scale_dn
+    monkeypatch.setattr(stack_statistics, "full_scale_dn", lambda s: looked.append(1) or look(s))
     camera = ((CAMERA_SETTINGS, {"pixel_format": "mono12", "full_scale_dn": 4095}),)
     bag = record(tmp_path / "bag", [wide(stacks[0])], *(camera if told else ()))
     assert evaluate(bag, "--output", tmp_path / "out", "--pictures", "none") == 0

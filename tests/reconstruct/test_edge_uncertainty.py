@@ -11,19 +11,20 @@ from sl_bench.world.optics import Optics
 from sl_bench.world.surfaces import make_surface
 from sl_bench.world.world import World
 from sl_projector.sequence.pattern_sequence import PatternSequence, named
-from sl_reconstruct.decode.decode_plan import DecodePlan
+from sl_reconstruct.decode.axis_decoder import first_tuning
+from sl_reconstruct.decode.decode_plan import DecodePlan, make_layout
 from sl_reconstruct.decode.edge_uncertainty import find_centres, widen_edges
-from sl_reconstruct.decode.edges import Found, Tuning
+from sl_reconstruct.decode.edges import Tuning
 from sl_reconstruct.decode.settings import Settings
-from sl_reconstruct.decode.types import Lines
-from sl_reconstruct.reconstruction.correspondence import _lines
-from sl_reconstruct.reconstruction.reconstructor import Reconstructor, first_tuning, make_layout
+from sl_reconstruct.decode.types import Lines, Noise, line_at
+from sl_reconstruct.reconstruction.correspondence import decode_columns
+from sl_reconstruct.reconstruction.reconstructor import Reconstructor
 from support.bench_scenes import NOMINAL_S, small_rig, tilt
 
 Array = NDArray[np.float64]
 
 PAPER = DecodePlan.of(named("paper"))
-LAYOUT = make_layout(PAPER.column, PAPER.white, PAPER.black)
+LAYOUT = make_layout(PAPER.column)
 K = np.arange(PAPER.column.size_px, dtype=np.float64)
 IS_EDGE, IS_CENTRE = LAYOUT.edge_owner >= 0, LAYOUT.centre_owner >= 0
 OWN_PX = 1e-3
@@ -35,17 +36,22 @@ def tuning() -> Tuning:
     return first._replace(scale=1.3, blur_px=1.1, jump_px=np.inf)
 
 
-def row_of(u_px: Array, level_dn: Array | float = 200.0) -> Found:
+def row_of(u_px: Array, level_dn: Array | float = 200.0) -> Lines:
     """A row whose boundaries are all found, each with the same noise."""
     n = u_px.size
-    return Found(
+    return Lines(
         u_px.astype(np.float32), np.full(n, OWN_PX, np.float32), np.ones(n, np.float32),
         np.broadcast_to(np.float32(level_dn), n).copy(), np.zeros(n, np.uint8),
+        np.zeros((len(PAPER.column.sources), 2), np.int32),
     )  # fmt: skip
 
 
-def widen(t: Tuning, row: Found) -> None:
-    widen_edges(t, row.u_px, row.level_dn, row.sigma_px)
+def widened(t: Tuning, row: Lines) -> NDArray[np.float32]:
+    """Sigma with bends and uneven light; that of noise alone stays as it is."""
+    wide_px, noise_px = np.empty_like(row.sigma_px), row.sigma_px.copy()
+    widen_edges(t, row, wide_px)
+    np.testing.assert_array_equal(row.sigma_px, noise_px)
+    return wide_px
 
 
 def centres_of(u_px: Array) -> tuple[Array, Array]:
@@ -64,8 +70,7 @@ def test_a_straight_row_keeps_its_sigma() -> None:
     assert np.abs(error).max() < 2e-4  # float32 at 1300 px
     assert sigma_px == pytest.approx(OWN_PX / np.sqrt(2), rel=1e-6)
     row = row_of(40.0 + 1.3 * K)
-    widen(tuning(), row)
-    assert row.sigma_px == pytest.approx(OWN_PX, rel=1e-6)
+    assert widened(tuning(), row) == pytest.approx(OWN_PX, rel=1e-6)
 
 
 def test_a_centre_on_a_parabola_states_its_error() -> None:
@@ -98,14 +103,12 @@ def test_light_and_bend_widen_an_edge_by_what_they_may_do() -> None:
     t, slope, bend = tuning(), 0.01, 0.03
     straight = 40.05 + 1.3 * np.arange(64.0)
     lit = row_of(straight, 100.0 * np.exp(slope * np.round(straight)))
-    widen(t, lit)
     # Towards the lighter side over one or two pixels the slope is (exp(2 g) - 1) / 2, 1 % more.
     expected = np.hypot(OWN_PX, slope * 1.1**2)
-    assert lit.sigma_px[2:-2] == pytest.approx(expected, rel=0.015)
+    assert widened(t, lit)[2:-2] == pytest.approx(expected, rel=0.015)
     bent = row_of(straight + bend * (np.arange(64) - 32.0) ** 2 / 2)
-    widen(t, bent)
     expected = np.hypot(OWN_PX, bend * 1.1**2 / (4 * 1.3**2))
-    assert bent.sigma_px[2:-2] == pytest.approx(expected, rel=0.02)
+    assert widened(t, bent)[2:-2] == pytest.approx(expected, rel=0.02)
 
 
 def test_neighbours_on_one_side_are_enough() -> None:
@@ -114,12 +117,9 @@ def test_neighbours_on_one_side_are_enough() -> None:
     whole, half = (row_of(u, 300.0 + 2.0 * np.round(u)) for _ in range(2))
     half.u_px[:31] = np.nan
     half.level_dn[:31] = 1e6  # what was left there by another row
-    widen(t, whole)
-    widen(t, half)
-    assert half.sigma_px[31:] == pytest.approx(whole.sigma_px[31:], rel=0.1)
+    assert widened(t, half)[31:] == pytest.approx(widened(t, whole)[31:], rel=0.1)
     lonely = row_of(np.where(np.arange(64) == 32, 50.0, np.nan))
-    widen(t, lonely)
-    assert lonely.sigma_px[32] == np.float32(OWN_PX)
+    assert widened(t, lonely)[32] == np.float32(OWN_PX)
 
 
 LENS_PX, PITCH_PX, START_PX, COLUMNS, DMD_PX = 0.9, 1.4, 20.3, 760, 512
@@ -146,7 +146,7 @@ def _seen_in_ramps(sequence: PatternSequence) -> Lines:
         line = 60.0 + 1000.0 * seen[_FINE // 2 :: _FINE]
         noisy = line + rng.normal(0, 1.0, (16, COLUMNS))
         frames.append(np.clip(np.rint(noisy), 0, 4095).astype(np.uint16))
-    return _lines(np.array(frames), DecodePlan.of(sequence), Settings())
+    return decode_columns(np.array(frames), sequence, Settings())
 
 
 def test_light_that_grows_moves_an_edge_and_sigma_says_so() -> None:
@@ -166,10 +166,9 @@ def test_light_that_grows_moves_an_edge_and_sigma_says_so() -> None:
     # 16 rows of 5e-4 px leave 1e-4. Point samples of so narrow a blur add 3e-3 by their phase.
     assert error == pytest.approx(shift, abs=4e-3)
     assert np.mean(error / shift) == pytest.approx(1.0, abs=0.1)
-    t = tuning()._replace(scale=PITCH_PX, blur_px=LENS_PX, noise_dn2=1.1)
-    for row in range(len(lines.u_px)):
-        widen_edges(t, lines.u_px[row], lines.level_dn[row], lines.sigma_px[row])
-    score = error / lines.sigma_px[:, inside].mean(axis=0)
+    t = tuning()._replace(scale=PITCH_PX, blur_px=LENS_PX, noise=Noise(1.1, 0.0))
+    sigma_px = np.array([widened(t, line_at(lines, row)) for row in range(len(lines.u_px))])
+    score = error / sigma_px[:, inside].mean(axis=0)
     # All of the blur is the lens's here, so the error is the most that sigma allows for.
     assert np.median(np.abs(score)) == pytest.approx(1.0, abs=0.15)
     assert np.abs(score).max() < 1.6

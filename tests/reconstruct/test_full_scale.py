@@ -9,8 +9,8 @@ import pytest
 
 from sl_projector.sequence.pattern_sequence import named
 from sl_reconstruct.cloud.cloud import Cloud
-from sl_reconstruct.decode.full_scale import full_scale_dn, saturation_of
 from sl_reconstruct.decode.settings import Settings
+from sl_reconstruct.decode.stack_statistics import full_scale_dn, saturation_of
 from sl_reconstruct.reconstruction.reconstructor import Reconstructor
 from support.stripe_scenes import WHITE_DN, Plane, expose, noiseless, small_rig
 

@@ -7,11 +7,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from sl_common import row_threads as workers
 from sl_common.errors import ConfigError, StackError
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence, named
 from sl_reconstruct.cloud.cloud import CLOUD_DTYPE
 from sl_reconstruct.cloud.refusals import Reason
-from sl_reconstruct.decode import row_threads as workers
 from sl_reconstruct.decode.decode_plan import DecodePlan
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.model.rig import Rig
@@ -366,3 +366,17 @@ def test_rows_give_the_dmd_row_and_the_miss_of_the_rays() -> None:
     assert np.nanmedian(cloud.gap_m) < 0.2e-6
     error = cloud.points["z"][known] - scene.points_m(q[known])[:, 2]
     assert 0.9 < np.std(error / cloud.points["sigma"][known]) < 1.15
+
+
+def test_a_cloud_does_not_depend_on_the_stack_before() -> None:
+    """What an earlier stack left in the memory of a reconstructor must not reach sigma."""
+    rig, sequence = small_rig(width=320, height=120), named("precise-rows")
+    whole = expose(noiseless(Plane(rig, **TILT), sequence), 4)
+    half = whole.copy()
+    half[:, :, 160:] = np.rint(WHITE_DN * AMBIENT)
+    half[:, :, :160] = half[:, :, :160] // 2  # dimmer: its own noise is another part of its light
+    used = Reconstructor(rig, sequence)
+    used(whole)
+    again, fresh = used(half), Reconstructor(rig, sequence)(half)
+    assert fresh.present > 5000
+    assert again.points.tobytes() == fresh.points.tobytes()

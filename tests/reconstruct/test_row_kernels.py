@@ -10,10 +10,9 @@ from sl_projector.sequence.pattern_sequence import named
 from sl_reconstruct.cloud.cloud import CLOUD_DTYPE, median
 from sl_reconstruct.cloud.cloud_writer import present
 from sl_reconstruct.decode.bit_words import padded
-from sl_reconstruct.decode.decode_plan import DecodePlan
 from sl_reconstruct.decode.edges import TILE, find_crossings, source_row
 from sl_reconstruct.decode.settings import Settings
-from sl_reconstruct.reconstruction.correspondence import _lines
+from sl_reconstruct.reconstruction.correspondence import decode_columns
 
 
 @pytest.mark.parametrize(
@@ -45,7 +44,7 @@ def test_a_row_with_more_edges_than_a_tile_is_found_whole() -> None:
         for k in np.flatnonzero(steps):
             lit += steps[k] * 0.5 * (1 + erf((at - (k - 0.5)) / (np.sqrt(2) * 0.7)))
         frames.append(np.tile(np.rint(8 + 180 * lit), (rows, 1)).astype(np.uint8))
-    lines = _lines(np.array(frames), DecodePlan.of(sequence), Settings())
+    lines = decode_columns(np.array(frames), sequence, Settings())
     k = np.arange(4, 2044)
     edges_in_an_image = 2048 // 8
     assert edges_in_an_image > TILE

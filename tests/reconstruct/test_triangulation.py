@@ -21,7 +21,7 @@ from sl_reconstruct.model.geometry import (
     solve_slopes,
 )
 from sl_reconstruct.model.rig import BrownConrady, Division, Rig
-from sl_reconstruct.reconstruction.four_equation import miss_m, solve_four
+from sl_reconstruct.reconstruction.four_equation import Sight, miss_m, solve_four
 
 LENSES = {
     "paper": (Division(1.2e-8), Division(3.76e-8)),
@@ -90,7 +90,7 @@ def test_four_equations_agree_with_three_where_rays_meet(lenses: str) -> None:
         for device in (rig.camera, rig.projector):
             local = device.rotation @ p + device.translation_m
             slopes += [local[0] / local[2], local[1] / local[2]]
-        assert solve_four(g, *slopes, 0.01, 0.01, out)
+        assert solve_four(g, Sight(*slopes, 0.01, 0.01), out)
         assert np.abs(out[:3] - p).max() < 1e-10
         assert out[4] < 1e-12 and out[5] < 1e-6
 
@@ -116,6 +116,6 @@ def test_sigma_of_four_equations_is_the_spread() -> None:
         ):
             ray = device.rotation @ device.rays(point)
             slopes += [ray[0] / ray[2], ray[1] / ray[2]]
-        solve_four(g, *slopes, sigma_u, sigma_v, out)
+        solve_four(g, Sight(*slopes, sigma_u, sigma_v), out)
         z.append(out[2])
     assert np.std(z) == pytest.approx(out[3], rel=0.07)

@@ -32,8 +32,8 @@ from sl_common.json_file import write_json
 from sl_common.topics import TRIGGER
 from sl_projector.sequence.stack import Stack
 from sl_reconstruct.cloud.cloud import Cloud
-from sl_reconstruct.decode.full_scale import saturation_of
 from sl_reconstruct.decode.settings import Settings
+from sl_reconstruct.decode.stack_statistics import saturation_of
 from sl_reconstruct.reconstruction.reconstructor_cache import Workshop
 from sl_reconstruct.reconstruction.scan_quality import verdict
 from sl_reconstruct.scan.scan_summary import ScanSummary

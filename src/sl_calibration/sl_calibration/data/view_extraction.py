@@ -16,7 +16,7 @@ from sl_calibration.target.hole_detection import find_plate
 from sl_common.errors import CalibrationError
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence
 from sl_projector.sequence.stack import Stack
-from sl_reconstruct.decode.full_scale import full_scale_dn
+from sl_reconstruct.decode.stack_statistics import full_scale_dn
 from sl_reconstruct.reconstruction.correspondence import Correspondences, correspondences
 
 Array = NDArray[np.float64]

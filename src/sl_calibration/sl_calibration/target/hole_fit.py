@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from sl_calibration.target.blobs import Blobs, inverse_roots
 from sl_common.kernel_cache import kernel
-from sl_reconstruct.decode.row_threads import share_rows
+from sl_common.row_threads import share_rows
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]

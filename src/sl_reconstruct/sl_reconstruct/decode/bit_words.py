@@ -8,21 +8,36 @@ import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.extending import intrinsic
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 WORD = 64
 
 
-def padded(width: int, dtype: Any) -> NDArray[Any]:
-    """Zeros (width,), readable in words that begin at any of them or at the one behind."""
+def padded(width: int, dtype: DTypeLike) -> NDArray[Any]:
+    """Return zeros that `bits_from` can read from any of them, or from the one behind.
+
+    Parameters
+    ----------
+    width : int
+        Number of zeros.
+    dtype : dtype
+        float32 or uint8.
+    """
     return np.zeros((width // WORD + 2) * WORD, dtype)[:width]
 
 
 @intrinsic
 def bits_from(typingctx: Any, values: Any, at: Any) -> Any:
-    """Bits of 64 values from ``at`` on: set where a float is not negative, an integer not zero.
+    """Bits of 64 values: set where a float is not negative, an integer not zero.
 
-    Nothing checks that they lie in the array: it must be `padded`.
+    Parameters
+    ----------
+    typingctx
+        Is numba's own; callers leave it out.
+    values : ndarray of float32 or uint8
+        Made by `padded`: nothing checks that the 64 lie in the array.
+    at : int
+        Index of the first.
     """
     number = ir.FloatType() if isinstance(values.dtype, types.Float) else ir.IntType(8)
     assert values.dtype in (types.float32, types.uint8)
@@ -44,7 +59,15 @@ def bits_from(typingctx: Any, values: Any, at: Any) -> Any:
 
 @intrinsic
 def lowest_bit(typingctx: Any, word: Any) -> Any:
-    """Place of the lowest bit that is set in a word that is not 0."""
+    """Place of the lowest bit that is set.
+
+    Parameters
+    ----------
+    typingctx
+        Is numba's own; callers leave it out.
+    word : uint64
+        Not 0.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))

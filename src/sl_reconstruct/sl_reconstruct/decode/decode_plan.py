@@ -5,15 +5,17 @@ Everything the decoder knows about the patterns is derived here from the sequenc
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_common.errors import SequenceError
 from sl_projector.sequence.pattern_sequence import Axis, Pattern, PatternSequence
+from sl_reconstruct.decode.types import Layout
 
-#: Light must be known so far on either side of an edge, DMD pixels.
+#: Light must be known this far on either side of an edge, DMD pixels.
 MARGIN_PX = 2
 
 
@@ -50,7 +52,15 @@ class Source:
         return np.asarray((boundaries - self.rising_px) % (2 * self.half_period_px) == 0)
 
     def centre_at(self, boundaries: NDArray[np.int64], size_px: int) -> NDArray[np.bool_]:
-        """Which of the boundaries are centres of stripes whose both edges are on the DMD."""
+        """Which of the boundaries are centres of stripes whose both edges are on the DMD.
+
+        Parameters
+        ----------
+        boundaries : ndarray
+            Numbers k of boundaries.
+        size_px : int
+            DMD pixels along the axis.
+        """
         d = self.half_period_px
         inside = (boundaries - d > 0) & (boundaries + d < size_px)
         return inside & self.edge_at(boundaries + d)
@@ -86,6 +96,8 @@ class AxisPlan:
     unlit : tuple of int
         Boundaries about which no image is bright, so that the full light there is not known to a
         dynamic threshold (the code's first division).
+    white, black : int
+        Index of the fully lit and the dark image, -1 where there is none.
     """
 
     axis: Axis
@@ -95,6 +107,8 @@ class AxisPlan:
     images: tuple[int, ...]
     sources: tuple[Source, ...]
     unlit: tuple[int, ...]
+    white: int
+    black: int
 
     @property
     def dynamic(self) -> bool:
@@ -122,6 +136,47 @@ class AxisPlan:
         edge, centre = self.owners()
         return np.asarray((edge >= 0) | (centre >= 0))
 
+    def alone(self) -> AxisPlan:
+        """The same for a stack of this axis's images only."""
+        at = {image: i for i, image in enumerate(self.images)} | {-1: -1}
+        return replace(
+            self,
+            images=tuple(range(len(self.images))),
+            bits=tuple(replace(b, image=at[b.image], inverse=at[b.inverse]) for b in self.bits),
+            sources=tuple(
+                replace(s, image=at[s.image], inverse=at[s.inverse]) for s in self.sources
+            ),
+            white=at[self.white],
+            black=at[self.black],
+        )
+
+
+@functools.lru_cache(maxsize=8)
+def make_layout(plan: AxisPlan) -> Layout:
+    """Write an axis's plan as arrays for the kernels."""
+    edge_owner, centre_owner = plan.owners()
+    sources = [
+        (s.image, s.inverse, s.half_period_px, s.rising_px, s.edges, s.centres)
+        for s in plan.sources
+    ]
+    bits = [(b.image, b.inverse, b.flipped) for b in plan.bits]
+    turns = np.flatnonzero(np.diff(centre_owner >= 0, prepend=False, append=False))
+    centres = [
+        (first, stop, plan.sources[centre_owner[first]].half_period_px)
+        for first, stop in turns.reshape(-1, 2).tolist()
+    ]
+    return Layout(
+        sources=np.array(sources, np.int64),
+        edge_owner=edge_owner,
+        centre_owner=centre_owner,
+        bits=np.array(bits, np.int64),
+        images=np.array(plan.images, np.int64),
+        white=plan.white,
+        black=plan.black,
+        dynamic=plan.dynamic,
+        centres=np.array(centres, np.int64).reshape(-1, 3),
+    )
+
 
 @dataclass(frozen=True)
 class DecodePlan:
@@ -131,15 +186,11 @@ class DecodePlan:
     ----------
     count : int
         Images in the stack.
-    white, black : int
-        Index of the fully lit and the dark image, -1 where there is none.
     column, row : AxisPlan
         One plan for each coordinate; ``row`` is None where the sequence has no row patterns.
     """
 
     count: int
-    white: int
-    black: int
     column: AxisPlan
     row: AxisPlan | None
 
@@ -157,10 +208,7 @@ class DecodePlan:
                 f"sequence {sequence.name!r} has no column patterns; expected a Gray code"
             )
         row = _axis_plan(sequence, "row") if "row" in sequence.axes() else None
-        return cls(
-            len(sequence), _full(sequence, True), _full(sequence, False),
-            _axis_plan(sequence, "column"), row,
-        )  # fmt: skip
+        return cls(len(sequence), _axis_plan(sequence, "column"), row)
 
 
 def _full(sequence: PatternSequence, lit: bool) -> int:
@@ -259,7 +307,8 @@ def _axis_plan(sequence: PatternSequence, axis: Axis) -> AxisPlan:
     images = tuple(i for i, p in enumerate(sequence.patterns) if p.kind != "gray" or p.axis == axis)
     sources = tuple(_sources(patterns, size_px))
     unlit = _unlit([sequence.patterns[i] for i in images], size_px)
-    return AxisPlan(axis, size_px, tuple(bits), division_px, images, sources, unlit)
+    full = _full(sequence, True), _full(sequence, False)
+    return AxisPlan(axis, size_px, tuple(bits), division_px, images, sources, unlit, *full)
 
 
 def _unlit(patterns: list[Pattern], size_px: int) -> tuple[int, ...]:

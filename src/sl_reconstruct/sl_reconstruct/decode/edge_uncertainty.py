@@ -9,30 +9,30 @@ has how true sigma is with them, and how false without.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from sl_common.kernel_cache import kernel
 from sl_reconstruct.cloud.refusals import Reason
-from sl_reconstruct.decode.edges import PRESENT, UNLIT, Found, Tuning
-from sl_reconstruct.decode.types import Layout
+from sl_reconstruct.decode.edges import PRESENT, UNLIT, Tuning
+from sl_reconstruct.decode.types import Floats, Layout, Lines, Real
 
 STEP = int(Reason.STEP)
 
-#: So much of a squared measure of a bend, in its own variances, may be noise and is no bend.
+#: This much of a squared measure of a bend, in its own variances, may be noise.
 NOISE = 4.0
 #: A step of the light on one side, over a pixel or two, counts from twice as many deviations on:
-#: what is noise in it would move an edge by more than the edge's own noise.
+#: the noise in it would move an edge by more than the edge's own noise does.
 SIDE_NOISE = 4.0
 #: Variance of half a lead's miss over that of the centre: three edges and their extrapolation.
 LEAD_VARIANCE = 3.0
 
 
 @kernel(forceinline=True)
-def _average(first: int, stop: int, half: int, edge_owner: Any, out: Found) -> None:
+def _average(plan: Layout, run: int, out: Lines) -> None:
     """The centre of a stripe lies midway between its two edges, which one image shows."""
     u_px, sigma_px, width_px, reason = out.u_px, out.sigma_px, out.width_px, out.reason
+    first, stop, half = plan.centres[run, 0], plan.centres[run, 1], plan.centres[run, 2]
+    edge_owner = plan.edge_owner
     for i in range(first, stop):
         k = np.uint64(i)
         a, b = k - np.uint64(half), k + np.uint64(half)
@@ -46,13 +46,12 @@ def _average(first: int, stop: int, half: int, edge_owner: Any, out: Found) -> N
 
 
 @kernel(forceinline=True)
-def _lead(
-    u_px: Any, reason: Any, owner: Any, start: int, step: int, count: int
-) -> tuple[int, float, float]:
+def _lead(plan: Layout, out: Lines, start: int, step: int, count: int) -> tuple[int, float, float]:
     """Nearest edge from ``start`` on, its column, and the pace from it to the farthest one.
 
     Looks at ``count`` boundaries; the pace is NaN where there are fewer than two edges.
     """
+    u_px, reason, owner = out.u_px, out.reason, plan.edge_owner
     near = far = -1
     for i in range(count):
         k = start + step * i
@@ -65,7 +64,7 @@ def _lead(
 
 
 @kernel(forceinline=True)
-def _bent(sigma_px: float, curved: float, miss: float) -> Any:
+def _bent(sigma_px: Real, curved: Real, miss: Real) -> Real:
     """Sigma of a centre with what a bend between its edges does to it.
 
     ``curved``: square of D / 4 times the change of pace, the error on a surface of even curvature.
@@ -75,18 +74,20 @@ def _bent(sigma_px: float, curved: float, miss: float) -> Any:
     own = sigma_px * sigma_px
     half = 0.25 * miss * miss
     beyond = max(curved - NOISE * own, half - NOISE * LEAD_VARIANCE * own)
-    return np.sqrt(own + max(0.0, beyond))
+    wider: Real = np.sqrt(own + max(0.0, beyond))
+    return wider
 
 
 @kernel(forceinline=True)
-def _check(first: int, stop: int, half: int, edge_owner: Any, jump_px: float, out: Found) -> None:
+def _check(plan: Layout, run: int, jump_px: float, out: Lines) -> None:
     """Refuse centres to which the edges on both sides do not lead, and widen the others' sigma.
 
     A centre is taken from edges D away, so a depth step or a kink between them goes unseen.
     """
     u_px, sigma_px, reason = out.u_px, out.sigma_px, out.reason
-    a, u_a, pace_a = _lead(u_px, reason, edge_owner, first - 1, -1, half)
-    b, u_b, pace_b = _lead(u_px, reason, edge_owner, stop, 1, half)
+    first, stop, half = plan.centres[run, 0], plan.centres[run, 1], plan.centres[run, 2]
+    a, u_a, pace_a = _lead(plan, out, first - 1, -1, half)
+    b, u_b, pace_b = _lead(plan, out, stop, 1, half)
     curved = (0.25 * half * (pace_b - pace_a)) ** 2
     for i in range(first, stop):
         k = np.uint64(i)
@@ -102,18 +103,28 @@ def _check(first: int, stop: int, half: int, edge_owner: Any, jump_px: float, ou
 
 
 @kernel()
-def find_centres(plan: Layout, bars: bool, t: Tuning, out: Found) -> None:
-    """Take centres from the edges unless BR8 has found them (``bars``), and check them."""
-    centres = plan.centres
-    for i in range(centres.shape[0]):
-        first, stop, half = centres[i, 0], centres[i, 1], centres[i, 2]
+def find_centres(plan: Layout, bars: bool, t: Tuning, out: Lines) -> None:
+    """Take a row's centres from its edges, and check them.
+
+    Parameters
+    ----------
+    plan : Layout
+        Says which boundaries are centres.
+    bars : bool
+        Whether BR8 has found them already, so that they are only checked.
+    t : Tuning
+        Has the farthest that a centre may lie from where its neighbours lead.
+    out : Lines
+        The row: its edges are read, its centres written.
+    """
+    for run in range(plan.centres.shape[0]):
         if not bars:
-            _average(first, stop, half, plan.edge_owner, out)
-        _check(first, stop, half, plan.edge_owner, t.jump_px, out)
+            _average(plan, run, out)
+        _check(plan, run, t.jump_px, out)
 
 
 @kernel(forceinline=True)
-def _beyond(change: float, noise: float, apart: float) -> Any:
+def _beyond(change: Real, noise: Real, apart: Real) -> Real:
     """Square of a slope less what is noise in it; 0 where that is more, or nothing is known."""
     none = np.float32(0)
     square = (change * change - noise) / (apart * apart)
@@ -121,8 +132,8 @@ def _beyond(change: float, noise: float, apart: float) -> Any:
 
 
 @kernel()
-def widen_edges(t: Tuning, u_px: Any, level_dn: Any, sigma_px: Any) -> None:
-    """Widen a row's sigma where light is uneven or the surface bends under an edge.
+def widen_edges(t: Tuning, line: Lines, wide_px: Floats) -> None:
+    """Write a row's sigma, wider where light is uneven or the surface bends under an edge.
 
     Light that changes by the part g per pixel moves an edge by g times the square of the lens's
     blur; boundaries whose second difference is d by d / (2 scale^2) times V, where V = S^2 q^2 /
@@ -130,13 +141,25 @@ def widen_edges(t: Tuning, u_px: Any, level_dn: Any, sigma_px: Any) -> None:
     is shared out is not known: g s^2 and d s^2 / (4 scale^2) are the most that they can be.
 
     g is taken over four boundaries, or from one side where it is far steeper: beside a wall. Where
-    a neighbour is missing, those on the other side say it.
+    a neighbour is missing, those on the other side are used. The first and last two boundaries,
+    with too few neighbours, keep their sigma.
+
+    Parameters
+    ----------
+    t : Tuning
+        Has blur, scale and pixel noise.
+    line : Lines
+        The row; its sigma is that of noise alone.
+    wide_px : ndarray, (boundaries,)
+        Written to, camera pixels.
     """
+    u_px, level_dn, sigma_px, n = line.u_px, line.level_dn, line.sigma_px, line.u_px.size
+    wide_px[:2], wide_px[n - 2 :] = sigma_px[:2], sigma_px[n - 2 :]
     f, one, half, side = np.float32, np.float32(1), np.float32(0.5), np.float32(SIDE_NOISE)
     light_px4, bent_px = f(t.blur_px**4), f((0.5 * t.blur_px / t.scale) ** 4)
-    read, shot = f(2 * NOISE * t.noise_dn2), f(2 * NOISE * t.noise_dn)
+    read, shot = f(2 * NOISE * t.noise.read_dn2), f(2 * NOISE * t.noise.shot_dn)
     free = f(6 * NOISE)
-    for i in range(u_px.size - 4):
+    for i in range(n - 4):
         # Every load comes before the choices: only so are eight boundaries worked on at once.
         a, b, u, c, d = u_px[i], u_px[i + 1], u_px[i + 2], u_px[i + 3], u_px[i + 4]
         far_low, low, here = level_dn[i], level_dn[i + 1], level_dn[i + 2]
@@ -157,4 +180,4 @@ def widen_edges(t: Tuning, u_px: Any, level_dn: Any, sigma_px: Any) -> None:
         light = _beyond(high - low, noise, x_high - x_low)
         light = light if light > below else below
         light = light if light > above else above
-        sigma_px[i + 2] = np.sqrt(own + curved + light_px4 * light / (here * here))
+        wide_px[i + 2] = np.sqrt(own + curved + light_px4 * light / (here * here))

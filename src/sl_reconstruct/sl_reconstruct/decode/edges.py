@@ -9,7 +9,7 @@ a third-order curve to the samples around the crossing and finds its zero by sec
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from sl_common.kernel_cache import kernel
 from sl_reconstruct.cloud.refusals import Reason
 from sl_reconstruct.decode.bit_words import WORD, bits_from, lowest_bit, padded
 from sl_reconstruct.decode.gray_code import PixelRow, count_shift
+from sl_reconstruct.decode.types import Bytes, Floats, Noise, Pixels
 
 #: Sub-pixel phases at which the noise gain of the estimator is tabulated.
 PHASES = 16
@@ -53,26 +54,53 @@ PRESENT = int(Reason.PRESENT)
 class Filter(NamedTuple):
     """How a signal becomes positions; one row for each source.
 
-    ``taps``: (sources, 1 + radius) half of the symmetric smoothing kernel. ``gain``: (sources,
-    PHASES + 1, 2) the sum of squared weights, alone and times the squared profile of a blurred
-    step. ``slope``: (sources,) expected slope of a unit step. The last row of gain and the last
-    slope are those of BR8.
+    Parameters
+    ----------
+    taps : ndarray, (sources, 1 + radius)
+        Half of the symmetric smoothing kernel.
+    gain : ndarray, (sources + 1, PHASES + 1, 2)
+        Sum of squared weights, alone and times the squared profile of a blurred step. The last
+        row is that of BR8.
+    slope : ndarray, (sources + 1,)
+        Expected slope of a unit step; the last is that of BR8.
     """
 
-    taps: NDArray[np.float32]
-    gain: NDArray[np.float32]
-    slope: NDArray[np.float32]
+    taps: Floats
+    gain: Floats
+    slope: Floats
 
 
 class Tuning(NamedTuple):
-    """What survey and settings say, in pixels, DMD pixels and DN.
+    """What the settings and a look at the stack say, in pixels, DMD pixels and DN.
 
-    ``direction``: +1 where k grows with u, -1 where it falls. ``reach_px``: beyond it an edge's
-    blur does not matter. ``around_px``: a fine stripe's half width. ``scale``: camera pixels per
-    DMD pixel. ``floor_dn``: keeps quotients finite. ``least_width``, ``most_width``: of an edge,
-    over what is expected. ``noise_dn2``, ``noise_dn``: variance = noise_dn2 + noise_dn * level.
-    ``jump_px``: a centre may lie so far from where the edges on a side lead. ``blur_px``: the
-    standard deviation of an edge's blur.
+    Parameters
+    ----------
+    direction : int
+        +1 where k grows with u, -1 where it falls.
+    reach_px : int
+        Beyond it an edge's blur does not matter.
+    around_px : int
+        Half the width of a fine stripe.
+    scale : float
+        Camera pixels per DMD pixel.
+    division_px, size_px : int
+        Width of the code's divisions and of the DMD, DMD pixels.
+    floor_dn : float
+        Keeps quotients finite.
+    lit_dn, contrast_dn : float
+        Least light of a pixel that counts as lit, and of an edge.
+    saturation : int
+        Pixels are saturated from here on, DN.
+    least_width, most_width : float
+        Of an edge, over what is expected.
+    min_light : float
+        Least light under an edge over that on its brighter side.
+    noise : Noise
+        Of a pixel.
+    jump_px : float
+        A centre may lie this far from where the edges on a side lead.
+    blur_px : float
+        Standard deviation of an edge's blur.
     """
 
     direction: int
@@ -88,114 +116,63 @@ class Tuning(NamedTuple):
     least_width: float
     most_width: float
     min_light: float
-    noise_dn2: float
-    noise_dn: float
+    noise: Noise
     jump_px: float
     blur_px: float
 
 
 class SourceRow(NamedTuple):
-    """Scratch for one source in one row: signal, filtered signal, crossings.
+    """Scratch for one source in one row.
 
-    ``at`` lists the crossings; ``tile`` holds the numbers of up to TILE of them, line by line.
+    Parameters
+    ----------
+    signal, filtered : ndarray, (width,)
+        Signal of the source, raw and filtered.
+    at : ndarray, (width,)
+        Pixels left of the crossings.
+    tile : ndarray, (LINES * TILE,)
+        Numbers of up to TILE crossings, line by line.
     """
 
-    signal: NDArray[np.float32]
-    filtered: NDArray[np.float32]
+    signal: Floats
+    filtered: Floats
     at: NDArray[np.uint32]
-    tile: NDArray[np.float32]
+    tile: Floats
 
 
-class Found(NamedTuple):
-    """What a row's edges are written to, one entry for each boundary."""
-
-    u_px: NDArray[np.float32]
-    sigma_px: NDArray[np.float32]
-    width_px: NDArray[np.float32]
-    level_dn: NDArray[np.float32]
-    reason: NDArray[np.uint8]
+#: For kernels that look at pixels only.
+NO_FILTER = Filter(
+    np.zeros((0, 1), np.float32), np.zeros((0, PHASES + 1, 2), np.float32), np.zeros(0, np.float32)
+)
 
 
 def source_row(width: int) -> SourceRow:
     """Return scratch for rows of ``width`` pixels."""
+    signal, filtered = np.zeros(width, np.float32), padded(width, np.float32)
     return SourceRow(
-        np.zeros(width, np.float32), padded(width, np.float32),
-        np.zeros(width, np.uint32), np.zeros(LINES * TILE, np.float32),
-    )  # fmt: skip
-
-
-@kernel()
-def pair_signal(pattern: Any, inverse: Any, floor_dn: float, signal: Any) -> None:
-    """(P - N) / (P + N): free of albedo and of light that is always there."""
-    floor = np.float32(floor_dn)
-    for x in range(signal.size):
-        a = np.float32(pattern[x])
-        b = np.float32(inverse[x])
-        signal[x] = (a - b) / (a + b + floor)
-
-
-@kernel()
-def single_signal(image: Any, p: PixelRow, floor_dn: float, signal: Any) -> None:
-    """(I - T) / (B - D) with the dynamic threshold; zero where it is unknown."""
-    floor = np.float32(floor_dn)
-    threshold, light = p.threshold, p.light
-    for x in range(signal.size):
-        a = light[x]
-        q = (np.float32(image[x]) - threshold[x]) / (a if a > floor else floor)
-        signal[x] = q if q == q else np.float32(0)
-
-
-@kernel()
-def smooth(signal: Any, taps: Any, out: Any) -> None:
-    """Convolve with a symmetric kernel; samples that it does not cover keep the raw signal."""
-    n, radius = signal.size, taps.size - 1
-    for x in range(radius):
-        out[x] = signal[x]
-        out[n - 1 - x] = signal[n - 1 - x]
-    inner, mid = out[radius : n - radius], signal[radius : n - radius]
-    done = min(4, radius)
-    if done == 4:  # one pass for the usual kernels
-        _smooth_nine(signal[radius - 4 : n - radius + 4], taps, inner)
-    else:
-        done = 0
-        for x in range(inner.size):
-            inner[x] = taps[0] * mid[x]
-    for j in range(done + 1, radius + 1):
-        left, right = signal[radius - j : n - radius - j], signal[radius + j : n - radius + j]
-        w = taps[j]
-        for x in range(inner.size):
-            inner[x] += w * (left[x] + right[x])
-
-
-@kernel()
-def _smooth_nine(s: Any, taps: Any, out: Any) -> None:
-    a, b, c, d, e = taps[0], taps[1], taps[2], taps[3], taps[4]
-    n = out.size
-    s1, s2, s3, s4, s5 = s[1:], s[2:], s[3:], s[4:], s[5:]
-    s6, s7, s8 = s[6:], s[7:], s[8:]
-    for x in range(n):
-        near = a * s4[x] + b * (s3[x] + s5[x]) + c * (s2[x] + s6[x])
-        out[x] = near + d * (s1[x] + s7[x]) + e * (s[x] + s8[x])
-
-
-@kernel()
-def bar_centres(signal: Any, out: Any) -> None:
-    """BR8, Eq. (6): the four samples on the left minus the four on the right."""
-    n = signal.size
-    for x in range(n):
-        out[x] = 0
-    inner = out[4 : n - 4]
-    for j in range(1, 5):
-        left, right = signal[4 - j : n - 4 - j], signal[4 + j : n - 4 + j]
-        for x in range(inner.size):
-            inner[x] += left[x] - right[x]
+        signal, filtered, np.zeros(width, np.uint32), np.zeros(LINES * TILE, np.float32)
+    )
 
 
 @kernel(forceinline=True)
-def find_crossings(lit: Any, filtered: Any, at: Any, first: int, last: int) -> int:
+def find_crossings(
+    lit: Bytes, filtered: Floats, at: NDArray[np.uint32], first: int, last: int
+) -> int:
     """List where the signal changes sign between a pixel and the next, and either is lit.
 
-    Returns their number; only pixels ``first <= x < last`` are listed.
+    Parameters
+    ----------
+    lit, filtered : ndarray, (width,)
+        Which pixels are lit, and the signal; both `padded`.
+    at : ndarray, (width,)
+        The left pixels of the crossings are written to its beginning.
+    first, last : int
+        Only pixels ``first <= x < last`` are listed.
+
+    Returns
+    -------
+    int
+        Number of crossings.
     """
     found, one, every = 0, np.uint64(1), ~np.uint64(0)
     for x in range(first - first % WORD, last, WORD):
@@ -214,7 +191,19 @@ def find_crossings(lit: Any, filtered: Any, at: Any, first: int, last: int) -> i
 
 @kernel(forceinline=True)
 def gather(p: PixelRow, r: SourceRow, first: int, n: int, t: Tuning) -> None:
-    """Put what lies about n crossings from ``first`` on into the tile."""
+    """Put what lies about some crossings into the tile.
+
+    Parameters
+    ----------
+    p : PixelRow
+        Light, code and saturation of the row.
+    r : SourceRow
+        Has the crossings and the tile.
+    first, n : int
+        The crossings ``first:first + n``.
+    t : Tuning
+        Says how far from an edge its light is taken.
+    """
     at, tile, filtered = r.at[first : first + n], r.tile, r.filtered
     light, code, clipped = p.light, p.code, p.clipped
     one, two, reach = np.uint64(1), np.uint64(2), np.uint64(t.reach_px)
@@ -236,8 +225,8 @@ def gather(p: PixelRow, r: SourceRow, first: int, n: int, t: Tuning) -> None:
 
 
 @kernel(forceinline=True)
-def gather_pair(pattern: Any, inverse: Any, r: SourceRow, first: int, n: int) -> None:
-    """Put the light of a pair at its crossings into the tile."""
+def gather_pair(pattern: Pixels, inverse: Pixels, r: SourceRow, first: int, n: int) -> None:
+    """Put P + N at the crossings of a pair into the tile; parameters as in `gather`."""
     at, tile = r.at[first : first + n], r.tile
     for i in range(n):
         x = np.uint64(at[i])
@@ -246,7 +235,7 @@ def gather_pair(pattern: Any, inverse: Any, r: SourceRow, first: int, n: int) ->
 
 @kernel(forceinline=True)
 def gather_single(p: PixelRow, r: SourceRow, first: int, n: int) -> None:
-    """Put the threshold at a single image's crossings, and what it rests on, into the tile."""
+    """Put a single image's threshold and its numbers of samples into the tile, as `gather`."""
     at, tile = r.at[first : first + n], r.tile
     threshold, bright, dark = p.threshold, p.bright, p.dark
     shift = count_shift(bright.itemsize)
@@ -257,8 +246,8 @@ def gather_single(p: PixelRow, r: SourceRow, first: int, n: int) -> None:
 
 
 @kernel()
-def find_zeros(tile: Any, n: int) -> None:
-    """Zero of the cubic through four samples about each crossing, and the slope there.
+def find_zeros(tile: Floats, n: int) -> None:
+    """Zero of the cubic through four samples about each of n crossings, and the slope there.
 
     A secant between the two middle samples, and one Newton step: the filtered signal is nearly
     straight, and 1e-5 px are left. Where the cubic has no zero there, the fraction leaves [0, 1].
@@ -278,8 +267,8 @@ def find_zeros(tile: Any, n: int) -> None:
 
 
 @kernel()
-def refuse_dim_edges(tile: Any, n: int, t: Tuning) -> None:
-    """Write for each crossing why the light under it does not do, or 0."""
+def refuse_dim_edges(tile: Floats, n: int, t: Tuning) -> None:
+    """Write for each of n crossings why the light under it does not do, or 0."""
     contrast, saturation, shadow = np.float32(CONTRAST), np.float32(SATURATION), np.float32(SHADOW)
     none = np.float32(0)
     for i in range(n):
@@ -297,12 +286,25 @@ def refuse_dim_edges(tile: Any, n: int, t: Tuning) -> None:
 
 
 @kernel()
-def identify(tile: Any, n: int, rising_px: int, half: int, flip: bool, t: Tuning) -> None:
+def identify(tile: Floats, n: int, rising_px: int, half: int, flip: bool, t: Tuning) -> None:
     """Name the boundary k of each crossing, and whether the evidence agrees.
 
     The edge's pattern and polarity say k modulo 4 D; the Gray code on either side says where.
     Where they disagree, the pattern's edge next to the code's place is named. k is 0 where there
-    is none on the DMD. ``flip`` exchanges the polarities.
+    is none on the DMD.
+
+    Parameters
+    ----------
+    tile : ndarray
+        Has the crossings; their K and AGREED are written.
+    n : int
+        Number of crossings.
+    rising_px, half : int
+        A boundary where the pattern turns bright, and D, DMD pixels.
+    flip : bool
+        Exchange the polarities.
+    t : Tuning
+        Direction, scale and size of code and DMD.
     """
     f, stripe = np.float32, np.float32(2 * half)
     near_px = f(max(0.5 * t.division_px + 1.5, min(0.9 * half, MISREAD_PX)))
@@ -327,36 +329,8 @@ def identify(tile: Any, n: int, rising_px: int, half: int, flip: bool, t: Tuning
 
 
 @kernel(forceinline=True)
-def pair_variance(
-    total: float, gain: float, profile_gain: float, plateau: float, read: float, shot: float
-) -> Any:
-    """Variance of a pair's filtered signal times total^2, DN^2; total = P + N at the edge.
-
-    var((P - N)/(P + N)) = [2 a (1 + q^2) + b S (1 - q^2)] / S^2 for pixel noise a + b * level.
-    """
-    q2 = profile_gain * plateau * plateau
-    return (read + read) * (gain + q2) + shot * total * (gain - q2)
-
-
-@kernel(forceinline=True)
-def single_variance(
-    threshold: float, swing: float, bright: float, dark: float, level: float,
-    read: float, shot: float,
-) -> Any:  # fmt: skip
-    """Variance of a single image's samples about ``level``, and of their threshold, DN^2.
-
-    The threshold is the middle between the means, ``swing`` off it, of so many bright and dark
-    samples.
-    """
-    high = read + shot * (threshold + swing)
-    low = read + shot * (threshold - swing)
-    quarter = np.float32(0.25)
-    return read + shot * level + quarter * (high * dark + low * bright) / (bright * dark)
-
-
-@kernel(forceinline=True)
-def look_up_gain(tile: Any, n: int, gain: Any) -> None:
-    """Noise gain of the estimator at the sub-pixel phase of each crossing."""
+def look_up_gain(tile: Floats, n: int, gain: Floats) -> None:
+    """Noise gain, (PHASES + 1, 2), of the estimator at the sub-pixel phase of n crossings."""
     phases, half, none = np.float32(PHASES), np.float32(0.5), np.float32(0)
     for i in range(n):
         phase = np.floor(tile[FRACTION + i] * phases + half)
@@ -368,43 +342,85 @@ def look_up_gain(tile: Any, n: int, gain: Any) -> None:
 
 
 @kernel()
-def weigh_pairs(tile: Any, n: int, full_slope: float, t: Tuning) -> None:
-    """Write sigma of each crossing of a pair, and how wide it is against what is expected."""
+def weigh_pairs(tile: Floats, n: int, full_slope: float, t: Tuning) -> None:
+    """Write sigma of each crossing of a pair, and how wide it is against what is expected.
+
+    For pixel noise a + b * level and S = P + N at the edge, where q is the plateau over S,
+    var((P - N)/(P + N)) = [2 a (1 + q^2) + b S (1 - q^2)] / S^2.
+
+    Parameters
+    ----------
+    tile : ndarray
+        Has the crossings; their SIGMA and WIDTH are written.
+    n : int
+        Number of crossings.
+    full_slope : float
+        Expected slope of a unit step, per pixel.
+    t : Tuning
+        Has the pixel noise.
+    """
     one, twice = np.float32(1), np.float32(2 * full_slope)
-    read, shot, floor = np.float32(t.noise_dn2), np.float32(t.noise_dn), np.float32(t.floor_dn)
+    read, shot = np.float32(t.noise.read_dn2), np.float32(t.noise.shot_dn)
+    floor = np.float32(t.floor_dn)
     for i in range(n):
         light = tile[UNDER + i]
         whole = tile[LEVEL + i] + floor
         plateau = light / whole
-        variance = pair_variance(whole, tile[GAIN + i], tile[PROFILE + i], plateau, read, shot)
+        gain, q2 = tile[GAIN + i], tile[PROFILE + i] * plateau * plateau
+        variance = (read + read) * (gain + q2) + shot * whole * (gain - q2)
         per_steep = one / (tile[SLOPE + i] * whole)
         tile[SIGMA + i] = np.sqrt(variance) * per_steep
         tile[WIDTH + i] = twice * light * per_steep
 
 
 @kernel()
-def weigh_singles(tile: Any, n: int, full_slope: float, centre: bool, t: Tuning) -> None:
+def weigh_singles(tile: Floats, n: int, full_slope: float, centre: bool, t: Tuning) -> None:
     """Write sigma and width of each crossing of a single image, or of BR8 on it.
 
-    An edge's samples lie about the threshold, those of a centre are all bright or all dark.
+    The threshold is the middle between the means of the pixel's bright and dark samples, so it
+    adds a quarter of the variance of each mean. An edge's samples lie about the threshold, those
+    of a centre are all bright or all dark.
+
+    Parameters
+    ----------
+    tile, n, full_slope, t
+        As in `weigh_pairs`.
+    centre : bool
+        Whether the crossings are those of BR8.
     """
     off, half = np.float32(0.5 if centre else 0.0), np.float32(0.5)
-    read, shot = np.float32(t.noise_dn2), np.float32(t.noise_dn)
-    expected, one, none = np.float32(full_slope), np.float32(1), np.float32(0)
+    quarter, one, none = np.float32(0.25), np.float32(1), np.float32(0)
+    read, shot = np.float32(t.noise.read_dn2), np.float32(t.noise.shot_dn)
+    expected = np.float32(full_slope)
     for i in range(n):
         light, threshold = tile[UNDER + i], tile[LEVEL + i]
         level = threshold + light * (off if tile[B + i] < none else -off)
         bright, dark = tile[BRIGHT + i], tile[DARK + i]
         bright, dark = bright if bright > one else one, dark if dark > one else one
-        variance = single_variance(threshold, half * light, bright, dark, level, read, shot)
+        swing = half * light
+        high, low = read + shot * (threshold + swing), read + shot * (threshold - swing)
+        means = quarter * (high * dark + low * bright) / (bright * dark)
+        variance = read + shot * level + means
         per_slope = one / tile[SLOPE + i]
         tile[SIGMA + i] = np.sqrt(variance * tile[GAIN + i]) * per_slope / light
         tile[WIDTH + i] = expected * per_slope
 
 
 @kernel(forceinline=True)
-def judge(tile: Any, n: int, least: float, most: float, tally: Any) -> None:
-    """Refuse crossings of another shape than the blur makes, or whose identity disagrees."""
+def judge(tile: Floats, n: int, least: float, most: float, tally: NDArray[np.int32]) -> None:
+    """Refuse crossings of another shape than the blur makes, or whose identity disagrees.
+
+    Parameters
+    ----------
+    tile : ndarray
+        Has the crossings; their WHY is written.
+    n : int
+        Number of crossings.
+    least, most : float
+        Bounds of an edge's width over the expected one.
+    tally : ndarray, (2,)
+        The accepted ones, and those of another identity, are added.
+    """
     low, high = np.float32(least), np.float32(most)
     first, last = np.float32(-0.5), np.float32(1.5)
     none, shape, identity = np.float32(0), np.float32(SHAPE), np.float32(IDENTITY)

@@ -6,13 +6,14 @@ that the compiler can turn them into vector instructions on the stack's own smal
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from sl_common.kernel_cache import kernel
 from sl_reconstruct.decode.bit_words import padded
+from sl_reconstruct.decode.types import Bytes, Floats, Integers, Layout, Pixels
 
 #: Distance over which a threshold is carried to pixels that saw only bright or only dark.
 CARRY_PX = 16
@@ -20,62 +21,77 @@ CARRY_PX = 16
 MAX_SAMPLES = 15
 COUNT_SHIFT_8, COUNT_SHIFT_16 = 12, 20
 
+#: Sums of grey values, with their count in the upper bits.
+Sums = NDArray[np.uint16] | NDArray[np.uint32]
+
 
 class PixelRow(NamedTuple):
     """Scratch for one camera row, all of the image's width.
 
-    ``low``, ``high``: dark and bright level (or darkest and brightest sample), stack type.
-    ``middle``: integer threshold between them. ``light``: bright minus dark, DN.
-    ``threshold``: sub-DN threshold, NaN where unknown (dynamic only). ``bright``, ``dark``:
-    clean samples (dynamic only), their sum in the low bits and their count above.
-    ``ratio``: dark over bright level; ``unknown``: where it is not known, a byte each, seen as
-    ``words`` too. ``bit``, ``clean``, ``parity``: a bit plane, where it is far from its edges,
-    and the running parity. ``code``: division number. ``lit``: 1 where lit; ``clipped``: 1 where
-    saturated; ``any_clipped``: whether any is.
+    Parameters
+    ----------
+    low, high, middle : ndarray of the stack's type
+        Dark and bright level (or darkest and brightest sample), and a threshold between them.
+    light : ndarray
+        Bright minus dark, DN.
+    threshold : ndarray
+        Threshold with fractions of a DN, NaN where unknown; of single images only.
+    ratio : ndarray
+        Dark over bright level.
+    words, unknown : ndarray
+        Where the ratio is not known, a byte each, and the same memory as words.
+    bright, dark : ndarray
+        Samples far from edges, their sum in the low bits and their count above; of single images.
+    bit, clean, parity : ndarray
+        A bit plane, where it is far from its edges, and the running parity.
+    code : ndarray
+        Number of the division.
+    lit, clipped : ndarray
+        1 where lit, 1 where saturated.
+    any_clipped : ndarray, (1,)
+        Whether any is saturated.
     """
 
-    low: NDArray[Any]
-    high: NDArray[Any]
-    middle: NDArray[Any]
-    light: NDArray[np.float32]
-    threshold: NDArray[np.float32]
-    ratio: NDArray[np.float32]
+    low: Pixels
+    high: Pixels
+    middle: Pixels
+    light: Floats
+    threshold: Floats
+    ratio: Floats
     words: NDArray[np.uint64]
-    unknown: NDArray[np.uint8]
-    bright: NDArray[Any]
-    dark: NDArray[Any]
-    bit: NDArray[np.uint8]
-    clean: NDArray[np.uint8]
-    parity: NDArray[np.uint8]
+    unknown: Bytes
+    bright: Sums
+    dark: Sums
+    bit: Bytes
+    clean: Bytes
+    parity: Bytes
     code: NDArray[np.uint16]
-    lit: NDArray[np.uint8]
-    clipped: NDArray[np.uint8]
-    any_clipped: NDArray[np.uint8]
+    lit: Bytes
+    clipped: Bytes
+    any_clipped: Bytes
 
 
-def pixel_row(width: int, dtype: Any) -> PixelRow:
+def pixel_row(width: int, dtype: DTypeLike) -> PixelRow:
     """Return scratch for rows of ``width`` pixels of a stack of type ``dtype``."""
     sums = np.uint16 if dtype == np.uint8 else np.uint32
+    bright, dark = np.zeros((2, width), sums)
     words = np.zeros((width + 7) // 8, np.uint64)
     low, high, middle = (np.zeros(width, dtype) for _ in range(3))
     light, threshold, ratio = (np.zeros(width, np.float32) for _ in range(3))
     bit, clean, parity, clipped = (np.zeros(width, np.uint8) for _ in range(4))
-    lit = padded(width, np.uint8)
-    return PixelRow(
-        low, high, middle, light, threshold, ratio, words, words.view(np.uint8),
-        np.zeros(width, sums), np.zeros(width, sums), bit, clean, parity,
-        np.zeros(width, np.uint16), lit, clipped, np.zeros(1, np.uint8),
-    )  # fmt: skip
+    unknown, code, lit = words.view(np.uint8), np.zeros(width, np.uint16), padded(width, np.uint8)
+    levels = low, high, middle, light, threshold, ratio, words, unknown, bright, dark
+    return PixelRow(*levels, bit, clean, parity, code, lit, clipped, np.zeros(1, np.uint8))
 
 
 @kernel()
-def _copy(source: Any, target: Any) -> None:
+def _copy(source: Pixels, target: Pixels) -> None:
     for x in range(source.size):
         target[x] = source[x]
 
 
 @kernel()
-def _stretch(row: Any, low: Any, high: Any) -> None:
+def _stretch(row: Pixels, low: Pixels, high: Pixels) -> None:
     for x in range(row.size):
         v = row[x]
         a = low[x]
@@ -85,11 +101,24 @@ def _stretch(row: Any, low: Any, high: Any) -> None:
 
 
 @kernel()
-def set_levels(stack: Any, y: int, white: int, black: int, images: Any, p: PixelRow) -> None:
-    """Fill ``low``, ``high``, ``middle`` and ``light`` from white and black, or all images."""
-    if white >= 0 and black >= 0:
-        _copy(stack[white, y], p.high)
-        _copy(stack[black, y], p.low)
+def set_levels(stack: Pixels, y: int, plan: Layout, p: PixelRow) -> None:
+    """Fill ``low``, ``high``, ``middle`` and ``light`` from white and black, or all images.
+
+    Parameters
+    ----------
+    stack : ndarray, (N, H, W)
+        The images.
+    y : int
+        The row.
+    plan : Layout
+        Says which images these are.
+    p : PixelRow
+        Written to.
+    """
+    images = plan.images
+    if plan.white >= 0 and plan.black >= 0:
+        _copy(stack[plan.white, y], p.high)
+        _copy(stack[plan.black, y], p.low)
     else:
         _copy(stack[images[0], y], p.high)
         _copy(stack[images[0], y], p.low)
@@ -102,9 +131,9 @@ def set_levels(stack: Any, y: int, white: int, black: int, images: Any, p: Pixel
 
 
 @kernel()
-def set_code(stack: Any, y: int, bits: Any, p: PixelRow) -> None:
-    """Fill ``code``: the Gray code read as a binary number. bits: (n, 3) image, inverse, flip."""
-    parity, code = p.parity, p.code
+def set_code(stack: Pixels, y: int, plan: Layout, p: PixelRow) -> None:
+    """Fill ``code``, the Gray code read as a binary number; parameters as in `set_levels`."""
+    bits, parity, code = plan.bits, p.parity, p.code
     for x in range(code.size):
         parity[x] = 0
         code[x] = 0
@@ -119,7 +148,7 @@ def set_code(stack: Any, y: int, bits: Any, p: PixelRow) -> None:
 
 
 @kernel()
-def _find_clean(bit: Any, reach: int, clean: Any) -> None:
+def _find_clean(bit: Bytes, reach: int, clean: Bytes) -> None:
     """2 where bright and 0 where dark with no edge within ``reach`` pixels, else 1."""
     n = bit.size
     left, mid, right = bit[: n - 2 * reach], bit[reach : n - reach], bit[2 * reach :]
@@ -129,7 +158,7 @@ def _find_clean(bit: Any, reach: int, clean: Any) -> None:
 
 
 @kernel()
-def _add(row: Any, clean: Any, shift: int, bright: Any, dark: Any) -> None:
+def _add(row: Pixels, clean: Bytes, shift: int, bright: Sums, dark: Sums) -> None:
     """Add sample and count to the bright sums where ``clean`` is 2, to the dark where it is 0."""
     for x in range(row.size):
         sample = row[x] + (1 << shift)
@@ -138,7 +167,7 @@ def _add(row: Any, clean: Any, shift: int, bright: Any, dark: Any) -> None:
 
 
 @kernel()
-def _mean(sums: Any, shift: int, out: Any) -> None:
+def _mean(sums: Sums, shift: int, out: Floats) -> None:
     """Mean of the summed samples; NaN where there are none."""
     for x in range(out.size):
         count = sums[x] >> shift
@@ -146,7 +175,7 @@ def _mean(sums: Any, shift: int, out: Any) -> None:
 
 
 @kernel()
-def _carry(values: Any, unknown: Any, words: Any) -> None:
+def _carry(values: Floats, unknown: Bytes, words: NDArray[np.uint64]) -> None:
     """Carry values into gaps of at most CARRY_PX, on a straight line between their ends.
 
     ``unknown`` has a byte for each value, and is seen as ``words`` to pass over known ones.
@@ -172,7 +201,7 @@ def _carry(values: Any, unknown: Any, words: Any) -> None:
 
 
 @kernel()
-def _least_around(values: Any, reach: int, out: Any) -> None:
+def _least_around(values: Floats, reach: int, out: Floats) -> None:
     """Minimum within about ``reach`` pixels on either side, in place; ``out`` is scratch."""
     n, step, covered = values.size, 1, 0
     while covered < reach:
@@ -193,6 +222,15 @@ def _least_around(values: Any, reach: int, out: Any) -> None:
 def set_middle(around: int, p: PixelRow) -> None:
     """Fill ``middle`` where every image of a pixel may be bright, as for some codes.
 
+    Parameters
+    ----------
+    around : int
+        Half the width of the finest stripes, camera pixels.
+    p : PixelRow
+        Has the levels.
+
+    Notes
+    -----
     The ratio of dark to bright is that of ambient light and pattern, so it changes slowly,
     whatever the albedo does: its least value nearby is used with the pixel's own bright level.
     """
@@ -206,9 +244,20 @@ def set_middle(around: int, p: PixelRow) -> None:
 
 
 @kernel()
-def set_threshold(stack: Any, y: int, images: Any, reach: int, p: PixelRow) -> None:
+def set_threshold(stack: Pixels, y: int, images: Integers, reach: int, p: PixelRow) -> None:
     """Fill ``threshold`` and ``light``: the paper's dynamic threshold.
 
+    Parameters
+    ----------
+    stack, y, p
+        As in `set_levels`.
+    images : ndarray, (n,)
+        Images that are used.
+    reach : int
+        Samples this near to an edge of their image are left out, pixels.
+
+    Notes
+    -----
     The mean of the bright and the mean of the dark samples of the pixel, without samples near an
     edge of their image: means have no noise bias, as extremes have.
     """
@@ -256,7 +305,15 @@ def _fill_light(p: PixelRow) -> None:
 
 @kernel()
 def set_masks(p: PixelRow, lit_dn: float, saturation: int) -> None:
-    """Fill ``lit``, ``clipped`` and ``any_clipped``."""
+    """Fill ``lit``, ``clipped`` and ``any_clipped``.
+
+    Parameters
+    ----------
+    p : PixelRow
+        Has the levels.
+    lit_dn, saturation : float, int
+        Pixels with this much light are lit; with this bright level saturated.
+    """
     light, high, lit, clipped = p.light, p.high, p.lit, p.clipped
     for x in range(lit.size):
         lit[x] = np.uint8(light[x] >= np.float32(lit_dn))
@@ -269,5 +326,5 @@ def set_masks(p: PixelRow, lit_dn: float, saturation: int) -> None:
 
 @kernel()
 def count_shift(itemsize: int) -> int:
-    """Bits of a sum of samples below their count, for sums of so many bytes."""
+    """Bits of a sum of samples below their count, for sums of 2 or 4 bytes."""
     return COUNT_SHIFT_8 if itemsize == 2 else COUNT_SHIFT_16

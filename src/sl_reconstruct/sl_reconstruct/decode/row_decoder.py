@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sl_common.kernel_cache import kernel
 from sl_reconstruct.cloud.refusals import Reason
+from sl_reconstruct.decode.edge_signals import bar_centres, pair_signal, single_signal, smooth
 from sl_reconstruct.decode.edge_uncertainty import find_centres
 from sl_reconstruct.decode.edges import (
     FRACTION,
@@ -20,11 +20,9 @@ from sl_reconstruct.decode.edges import (
     WHY,
     WIDTH,
     Filter,
-    Found,
     K,
     SourceRow,
     Tuning,
-    bar_centres,
     find_crossings,
     find_zeros,
     gather,
@@ -33,10 +31,7 @@ from sl_reconstruct.decode.edges import (
     identify,
     judge,
     look_up_gain,
-    pair_signal,
     refuse_dim_edges,
-    single_signal,
-    smooth,
     source_row,
     weigh_pairs,
     weigh_singles,
@@ -50,31 +45,94 @@ from sl_reconstruct.decode.gray_code import (
     set_middle,
     set_threshold,
 )
-from sl_reconstruct.decode.types import Layout, Lines
+from sl_reconstruct.decode.types import (
+    CENTRES,
+    HALF_PERIOD,
+    IMAGE,
+    INVERSE,
+    RISING,
+    Bytes,
+    Integers,
+    Layout,
+    Lines,
+    Pixels,
+    line_at,
+)
 
 #: BR8's slope depends on the stripe's width and blur more than an edge's does.
 BAR_LATITUDE = 3.0
-#: So many boundaries that are not found are looked for one by one.
+#: Up to this number, boundaries that are not found are looked for one by one.
 FEW = 12
 
 ORDER = int(Reason.ORDER)
 MISSING = int(Reason.MISSING)
 
 
+class Decoding(NamedTuple):
+    """What the rows of a stack are decoded with.
+
+    Parameters
+    ----------
+    stack : ndarray, (N, H, W)
+        Images in pattern order.
+    plan : Layout
+        What they show.
+    tuning : Tuning
+        What is known of them.
+    filters : Filter
+        How their edges are found; not used by `decode_pixels`.
+    bars : bool
+        Whether centres are found by BR8.
+    """
+
+    stack: Pixels
+    plan: Layout
+    tuning: Tuning
+    filters: Filter
+    bars: bool
+
+
+class RowScratch(NamedTuple):
+    """Scratch of one thread: pixels, one source, and the divisions seen or lost in a row."""
+
+    pixels: PixelRow
+    source: SourceRow
+    seen: Bytes
+    blind: Bytes
+
+
+def row_scratch(d: Decoding) -> RowScratch:
+    """Return scratch for the rows of a stack."""
+    width, divisions = d.stack.shape[2], -(-d.tuning.size_px // d.tuning.division_px)
+    seen, blind = np.zeros((2, divisions), np.uint8)
+    return RowScratch(pixel_row(width, d.stack.dtype), source_row(width), seen, blind)
+
+
 @kernel()
-def decode_pixels(stack: Any, y: int, plan: Layout, t: Tuning, p: PixelRow) -> None:
-    """Fill everything that a row's pixels say by themselves."""
-    set_levels(stack, y, plan.white, plan.black, plan.images, p)
+def decode_pixels(d: Decoding, y: int, p: PixelRow) -> None:
+    """Fill everything that a row's pixels say by themselves.
+
+    Parameters
+    ----------
+    d : Decoding
+        The stack, its plan and tuning.
+    y : int
+        The row.
+    p : PixelRow
+        Written to.
+    """
+    plan, t = d.plan, d.tuning
+    set_levels(d.stack, y, plan, p)
     if plan.dynamic:
         set_middle(t.around_px, p)
-    set_code(stack, y, plan.bits, p)
+    set_code(d.stack, y, plan, p)
     if plan.dynamic:
-        set_threshold(stack, y, plan.images, t.reach_px, p)
+        set_threshold(d.stack, y, plan.images, t.reach_px, p)
     set_masks(p, t.lit_dn, t.saturation)
 
 
 @kernel(forceinline=True)
-def _settle(owner: Any, s: int, r: SourceRow, first: int, n: int, out: Found) -> None:
+def _settle(owner: Integers, s: int, r: SourceRow, first: int, n: int, out: Lines) -> None:
     """Write each crossing where it belongs; a boundary found twice is in doubt, and refused."""
     at, tile = r.at[first : first + n], r.tile
     u_px, sigma_px, width_px, reasons = out.u_px, out.sigma_px, out.width_px, out.reason
@@ -96,19 +154,18 @@ def _settle(owner: Any, s: int, r: SourceRow, first: int, n: int, out: Found) ->
 
 
 @kernel(forceinline=True)
-def _edges(
-    s: int, pattern: Any, inverse: Any, plan: Layout, f: Filter, t: Tuning, p: PixelRow,
-    r: SourceRow, out: Found, tally: Any,
-) -> None:  # fmt: skip
+def _edges(d: Decoding, y: int, s: int, scratch: RowScratch, out: Lines) -> None:
     """Find and identify the edges of one source."""
+    p, r, t, f, source = scratch.pixels, scratch.source, d.tuning, d.filters, d.plan.sources[s]
+    pattern, inverse = d.stack[source[IMAGE], y], d.stack[max(0, source[INVERSE]), y]
     margin = f.taps.shape[1] + t.reach_px  # neither filter nor threshold reach beyond the image
     count = find_crossings(p.lit, r.filtered, r.at, margin, r.filtered.size - margin - 1)
-    pair, tile = plan.sources[s, 1] >= 0, r.tile
+    pair, tile = source[INVERSE] >= 0, r.tile
     for first in range(0, count, TILE):
         n = min(TILE, count - first)
         gather(p, r, first, n, t)
         find_zeros(tile, n)
-        identify(tile, n, plan.sources[s, 3], plan.sources[s, 2], False, t)
+        identify(tile, n, source[RISING], source[HALF_PERIOD], False, t)
         refuse_dim_edges(tile, n, t)
         look_up_gain(tile, n, f.gain[s])
         if pair:
@@ -117,55 +174,50 @@ def _edges(
         else:
             gather_single(p, r, first, n)
             weigh_singles(tile, n, f.slope[s], False, t)
-        judge(tile, n, t.least_width, t.most_width, tally)
-        _settle(plan.edge_owner, s, r, first, n, out)
+        judge(tile, n, t.least_width, t.most_width, out.tally[s])
+        _settle(d.plan.edge_owner, s, r, first, n, out)
 
 
 @kernel(forceinline=True)
-def _bars(
-    s: int, plan: Layout, f: Filter, t: Tuning, p: PixelRow, r: SourceRow, out: Found, tally: Any
-) -> None:
+def _bars(d: Decoding, s: int, scratch: RowScratch, out: Lines) -> None:
     """Find and identify the centres of one source by BR8's zero crossings, Eq. (6)."""
+    p, r, t, f, source = scratch.pixels, scratch.source, d.tuning, d.filters, d.plan.sources[s]
     margin = 5 + t.reach_px
     count = find_crossings(p.lit, r.filtered, r.at, margin, r.filtered.size - margin - 1)
-    half, last, tile = plan.sources[s, 2], f.slope.size - 1, r.tile
+    half, last, tile = source[HALF_PERIOD], f.slope.size - 1, r.tile
     for first in range(0, count, TILE):
         n = min(TILE, count - first)
         gather(p, r, first, n, t)
         find_zeros(tile, n)
         # left of a bright centre the left samples are the darker ones, whichever way k grows
-        identify(tile, n, plan.sources[s, 3] + half, half, t.direction < 0, t)
+        identify(tile, n, source[RISING] + half, half, t.direction < 0, t)
         refuse_dim_edges(tile, n, t)
         look_up_gain(tile, n, f.gain[last])
         gather_single(p, r, first, n)
         weigh_singles(tile, n, f.slope[last], True, t)
-        judge(tile, n, t.least_width / BAR_LATITUDE, BAR_LATITUDE * t.most_width, tally)
-        _settle(plan.centre_owner, s, r, first, n, out)
+        judge(tile, n, t.least_width / BAR_LATITUDE, BAR_LATITUDE * t.most_width, out.tally[s])
+        _settle(d.plan.centre_owner, s, r, first, n, out)
 
 
 @kernel(forceinline=True)
-def _source(
-    stack: Any, y: int, s: int, plan: Layout, f: Filter, t: Tuning, p: PixelRow, r: SourceRow,
-    out: Found, tally: Any, bars: bool,
-) -> None:  # fmt: skip
+def _source(d: Decoding, y: int, s: int, scratch: RowScratch, out: Lines) -> None:
     """Everything that one source gives in one row."""
-    pattern = stack[plan.sources[s, 0], y]
-    inverse = stack[max(0, plan.sources[s, 1]), y]
-    if plan.sources[s, 1] >= 0:
-        pair_signal(pattern, inverse, t.floor_dn, r.signal)
+    r, source, floor_dn = scratch.source, d.plan.sources[s], d.tuning.floor_dn
+    pattern, inverse = d.stack[source[IMAGE], y], d.stack[max(0, source[INVERSE]), y]
+    if source[INVERSE] >= 0:
+        pair_signal(pattern, inverse, floor_dn, r.signal)
     else:
-        single_signal(pattern, p, t.floor_dn, r.signal)
-    smooth(r.signal, f.taps[s], r.filtered)
-    tally[0] = 0
-    tally[1] = 0
-    _edges(s, pattern, inverse, plan, f, t, p, r, out, tally)
-    if bars and plan.sources[s, 5]:
+        single_signal(pattern, scratch.pixels, floor_dn, r.signal)
+    smooth(r.signal, d.filters.taps[s], r.filtered)
+    out.tally[s] = 0
+    _edges(d, y, s, scratch, out)
+    if d.bars and source[CENTRES]:
         bar_centres(r.signal, r.filtered)
-        _bars(s, plan, f, t, p, r, out, tally)
+        _bars(d, s, scratch, out)
 
 
 @kernel()
-def _levels(p: PixelRow, dynamic: bool, out: Found) -> None:
+def _levels(p: PixelRow, dynamic: bool, out: Lines) -> None:
     """Bright level at every found boundary, DN."""
     u_px, level_dn, threshold, light, high = out.u_px, out.level_dn, p.threshold, p.light, p.high
     for k in range(u_px.size):
@@ -188,7 +240,7 @@ def _lit_divisions(p: PixelRow) -> tuple[int, int]:
 
 
 @kernel()
-def _lose(p: PixelRow, divisions: int, blind: Any) -> None:
+def _lose(p: PixelRow, divisions: int, blind: Bytes) -> None:
     """Mark divisions lost in saturation: those between lit pixels with clipped ones between."""
     last, gap = -1, 0
     code, lit, clipped = p.code, p.lit, p.clipped
@@ -206,7 +258,7 @@ def _lose(p: PixelRow, divisions: int, blind: Any) -> None:
 
 
 @kernel()
-def _see(p: PixelRow, seen: Any) -> None:
+def _see(p: PixelRow, seen: Bytes) -> None:
     """Mark divisions by their lit pixels: 1 where there is one, 3 where there are more."""
     code, lit = p.code, p.lit
     for x in range(code.size):
@@ -225,11 +277,10 @@ def _count_lit(p: PixelRow, division: int) -> int:
 
 
 @kernel()
-def _account(
-    plan: Layout, p: PixelRow, seen: Any, blind: Any, division_px: int, reason: Any
-) -> None:
+def _account(plan: Layout, scratch: RowScratch, division_px: int, reason: Bytes) -> None:
     """Name the boundaries that should be there, but were not found."""
     edge_owner, centre_owner = plan.edge_owner, plan.centre_owner
+    p, seen, blind = scratch.pixels, scratch.seen, scratch.blind
     low, high = _lit_divisions(p)
     first, last = max(1, low * division_px), min(reason.size, (high + 1) * division_px)
     unfound = 0
@@ -257,46 +308,31 @@ def _account(
 
 
 @kernel()
-def _row(
-    stack: Any, y: int, i: int, plan: Layout, f: Filter, t: Tuning, bars: bool,
-    scratch: RowScratch, lines: Lines,
-) -> None:  # fmt: skip
-    p, r, seen, blind = scratch.pixels, scratch.source, scratch.seen, scratch.blind
-    found = Found(
-        lines.u_px[i], lines.sigma_px[i], lines.width_px[i], lines.level_dn[i], lines.reason[i]
-    )
-    found.u_px[:] = np.nan
-    found.reason[:] = UNLIT
-    decode_pixels(stack, y, plan, t, p)
-    for s in range(plan.sources.shape[0]):
-        _source(stack, y, s, plan, f, t, p, r, found, lines.tally[i, s], bars)
-    find_centres(plan, bars, t, found)
-    _levels(p, plan.dynamic, found)
-    _account(plan, p, seen, blind, t.division_px, found.reason)
-
-
-class RowScratch(NamedTuple):
-    """Scratch of one thread: pixels, one source, and the divisions seen or lost in a row."""
-
-    pixels: PixelRow
-    source: SourceRow
-    seen: NDArray[np.uint8]
-    blind: NDArray[np.uint8]
-
-
-def row_scratch(width: int, dtype: Any, divisions: int) -> RowScratch:
-    """Return scratch for rows of ``width`` pixels and a code of so many divisions."""
-    return RowScratch(
-        pixel_row(width, dtype), source_row(width),
-        np.zeros(divisions, np.uint8), np.zeros(divisions, np.uint8),
-    )  # fmt: skip
+def _row(d: Decoding, y: int, out: Lines, scratch: RowScratch) -> None:
+    out.u_px[:] = np.nan
+    out.reason[:] = UNLIT
+    decode_pixels(d, y, scratch.pixels)
+    for s in range(d.plan.sources.shape[0]):
+        _source(d, y, s, scratch, out)
+    find_centres(d.plan, d.bars, d.tuning, out)
+    _levels(scratch.pixels, d.plan.dynamic, out)
+    _account(d.plan, scratch, d.tuning.division_px, out.reason)
 
 
 @kernel()
-def decode_rows(
-    ys: Any, first: int, last: int, stack: Any, plan: Layout, f: Filter, t: Tuning,
-    bars: bool, lines: Lines, scratch: RowScratch,
-) -> None:  # fmt: skip
-    """Decode the stack's rows ``ys[first:last]`` into the lines of the same numbers."""
-    for i in range(first, last):
-        _row(stack, ys[i], i, plan, f, t, bars, scratch, lines)
+def decode_rows(d: Decoding, ys: Integers, lines: Lines, scratch: RowScratch) -> None:
+    """Decode some rows of a stack.
+
+    Parameters
+    ----------
+    d : Decoding
+        The stack, and what it is decoded with.
+    ys : ndarray, (n,)
+        The rows.
+    lines : Lines
+        Of n rows, written to; width and level only of boundaries that are found.
+    scratch : RowScratch
+        Made by `row_scratch`, one for each thread.
+    """
+    for i in range(ys.size):
+        _row(d, ys[i], line_at(lines, i), scratch)

@@ -1,40 +1,65 @@
-"""A look at a few rows before all are decoded: direction, scale, noise and blur of this stack."""
+"""What a stack says about itself: full scale, direction and scale of the code, pixel noise."""
 
 from __future__ import annotations
-
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_common.kernel_cache import kernel
-from sl_reconstruct.decode.edges import Tuning
 from sl_reconstruct.decode.gray_code import PixelRow
-from sl_reconstruct.decode.row_decoder import decode_pixels
-from sl_reconstruct.decode.types import Layout
+from sl_reconstruct.decode.row_decoder import Decoding, decode_pixels
+from sl_reconstruct.decode.settings import Settings
+from sl_reconstruct.decode.types import Integers, Noise, Pixels
 
+#: Significant bits that cameras have.
+BITS = (8, 10, 12, 14, 16)
+#: What 8 bits in the upper end of 16 are multiples of.
+MAX_STEP = 256
 #: Rows looked at, evenly spread over the image.
 SURVEY_ROWS = 16
 #: Distance over which the code's growth is measured, camera pixels.
 LAG_PX = 32
 NOISE_BINS = 8
-#: Every so many surveyed rows the noise is measured.
-NOISE_STEP = 5
-#: Samples of one pixel must be at least so many before their scatter counts.
+#: The scatter of this many samples of one pixel and more counts.
 MIN_SAMPLES = 4
 
 Array = NDArray[np.float64]
 
 
-class Noise(NamedTuple):
-    """Pixel noise: variance = ``read_dn2 + shot_dn * level``, DN^2."""
+def saturation_of(stack: Pixels, settings: Settings) -> int:
+    """Value from which on pixels of a stack are saturated: as chosen, else its full scale."""
+    return settings.saturation_dn or full_scale_dn(stack)
 
-    read_dn2: float
-    shot_dn: float
 
-    def variance(self, level_dn: float) -> float:
-        """Variance of a pixel at a level, DN^2."""
-        return self.read_dn2 + self.shot_dn * level_dn
+def full_scale_dn(stack: Pixels) -> int:
+    """Largest value that a pixel of these images can have, as far as they show it.
+
+    Parameters
+    ----------
+    stack : ndarray of uint8 or uint16
+        Images as the camera gave them.
+
+    Returns
+    -------
+    int
+        255 for uint8. For uint16 the end of the fewest bits of `BITS` that hold all values; of
+        values that are all multiples of 2, 4, ... (bits put in the upper end), that multiple less.
+        Too few bits are taken for images whose brightest pixel is below a quarter of the full
+        scale: nothing is saturated there, whatever the number.
+
+    Examples
+    --------
+    >>> full_scale_dn(np.array([17, 4095], np.uint16)), full_scale_dn(np.array([4096], np.uint16))
+    (4095, 16383)
+    >>> full_scale_dn(np.array([0x0110, 0xFFF0], np.uint16))  # 12 bits in the upper end
+    65520
+    """
+    if stack.dtype == np.uint8:
+        return 255
+    used = int(np.bitwise_or.reduce(stack, axis=None))
+    bits = next(bits for bits in BITS if used < 1 << bits)
+    step = min(used & -used, MAX_STEP) if bits == BITS[-1] else 1
+    return (1 << bits) - step
 
 
 def survey_rows(height: int) -> NDArray[np.int64]:
@@ -43,48 +68,75 @@ def survey_rows(height: int) -> NDArray[np.int64]:
 
 
 @kernel()
-def code_growth(stack: Any, ys: Any, plan: Layout, t: Tuning, p: PixelRow) -> Any:
-    """DMD pixels that the code grows by per camera pixel, mean over lit pixels, and their count."""
+def code_growth(d: Decoding, ys: Integers, p: PixelRow) -> float:
+    """DMD pixels that the code grows by per camera pixel, mean over lit pixels.
+
+    Parameters
+    ----------
+    d : Decoding
+        The stack.
+    ys : ndarray, (n,)
+        Rows to look at.
+    p : PixelRow
+        Scratch.
+
+    Returns
+    -------
+    float
+        NaN where nothing is lit.
+    """
+    t = d.tuning
     divisions = (t.size_px + t.division_px - 1) // t.division_px
     total, count = 0, 0
     for y in ys:
-        decode_pixels(stack, y, plan, t, p)
+        decode_pixels(d, y, p)
         for x in range(p.code.size - LAG_PX):
             a, b = int(p.code[x]), int(p.code[x + LAG_PX])
             known = p.lit[x] and p.lit[x + LAG_PX] and max(a, b) < divisions
             if known and abs(b - a) * t.division_px <= 4 * LAG_PX:
                 total += (b - a) * t.division_px
                 count += 1
-    return total / (count * LAG_PX) if count else np.nan, count
+    return total / (count * LAG_PX) if count else np.nan
 
 
 @kernel()
-def _gather(stack: Any, y: int, plan: Layout, reach: int, p: PixelRow, sums: Any) -> None:
-    """Sum, sum of squares and count of each pixel's clean bright and dark samples."""
+def _gather(d: Decoding, y: int, p: PixelRow, sums: Array) -> None:
+    """Sum, sum of squares and count of each pixel's dark and bright samples far from edges."""
     sums[:] = 0
-    n = p.code.size
-    for i in plan.images:
-        row = stack[i, y]
+    n, reach = p.code.size, d.tuning.reach_px
+    for i in d.plan.images:
+        row = d.stack[i, y]
         for x in range(n):
             p.bit[x] = row[x] > p.middle[x]
         for x in range(reach, n - reach):
             b = p.bit[x]
             if p.lit[x] and p.bit[x - reach] == b and p.bit[x + reach] == b:
-                d = np.float64(row[x]) - np.float64(p.middle[x])
-                sums[b, x, 0] += d
-                sums[b, x, 1] += d * d
+                off = np.float64(row[x]) - np.float64(p.middle[x])
+                sums[b, x, 0] += off
+                sums[b, x, 1] += off * off
                 sums[b, x, 2] += 1
 
 
 @kernel()
-def sample_scatter(stack: Any, ys: Any, plan: Layout, t: Tuning, p: PixelRow) -> Any:
-    """Mean, variance and count of clean samples, shape (rows, 2, width, 3); count 0 = none."""
-    width = stack.shape[2]
+def sample_scatter(d: Decoding, ys: Integers, p: PixelRow) -> Array:
+    """Scatter of each pixel's dark and bright samples.
+
+    Parameters
+    ----------
+    d, ys, p
+        As in `code_growth`.
+
+    Returns
+    -------
+    ndarray, (rows, 2, width, 3)
+        Mean, variance and count of the dark and of the bright samples; count 0 is none.
+    """
+    width = d.stack.shape[2]
     out = np.zeros((ys.size, 2, width, 3))
     sums = np.zeros((2, width, 3))
     for i in range(ys.size):
-        decode_pixels(stack, ys[i], plan, t, p)
-        _gather(stack, ys[i], plan, t.reach_px, p, sums)
+        decode_pixels(d, ys[i], p)
+        _gather(d, ys[i], p, sums)
         for b in range(2):
             for x in range(width):
                 n = sums[b, x, 2]
@@ -131,10 +183,19 @@ def _bin_mean(part: Array) -> tuple[float, float, float]:
 
 
 def edge_bound(scatter: Array, noise: Noise, blur_px: float) -> float:
-    """Least standard deviation of an edge's position from one image, px (docs, design: noise).
+    """Least standard deviation of an edge's position from one image, pixels.
 
     ``(sigma / A) sqrt(2 sqrt(pi) s)`` with the height A of a step between the median dark and
     bright level, blurred to s, and the noise sigma half-way up. NaN where it is not known.
+
+    Parameters
+    ----------
+    scatter : ndarray, (rows, 2, width, 3)
+        Of `sample_scatter`.
+    noise : Noise
+        The model fitted to it.
+    blur_px : float
+        Standard deviation s of the edges' blur, camera pixels.
     """
     dark, bright = (part[part[..., 2] > 0][:, 0] for part in np.moveaxis(scatter, 1, 0))
     if not (dark.size and bright.size and noise.read_dn2 >= 0):

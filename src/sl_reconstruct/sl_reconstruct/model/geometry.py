@@ -8,7 +8,7 @@ Lengths are metres, arithmetic is double.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +25,22 @@ SOLVED = 1e-9
 EXACT = 1e-14
 
 Array = NDArray[np.float64]
+#: Camera columns or DMD columns; the kernels take either precision.
+Columns = NDArray[np.float32] | NDArray[np.float64]
 
 
 class Optics(NamedTuple):
-    """A device's image side: ``model``, (fx, fy, Cu, Cv) and the lens's five numbers."""
+    """A device's image side.
+
+    Parameters
+    ----------
+    model : int
+        DIVISION or BROWN_CONRADY.
+    fx, fy, cu, cv : float
+        Focal lengths and image centre, pixels.
+    lens : ndarray, (5,)
+        kappa (px^-2), or k1, k2, p1, p2, k3.
+    """
 
     model: int
     fx: float
@@ -41,8 +53,18 @@ class Optics(NamedTuple):
 class Geometry(NamedTuple):
     """A rig for the kernels.
 
-    ``origin``: camera centre in the world; ``world``: world_from_camera rotation; ``a``: camera
-    centre in the projector; ``b``: projector_from_camera rotation.
+    Parameters
+    ----------
+    camera, projector : Optics
+        Image sides of the devices.
+    origin : ndarray, (3,)
+        Camera centre in the world, metres.
+    world : ndarray, (3, 3)
+        world_from_camera rotation.
+    a : ndarray, (3,)
+        Camera centre in the projector, metres.
+    b : ndarray, (3, 3)
+        projector_from_camera rotation.
     """
 
     camera: Optics
@@ -63,7 +85,7 @@ X, Y, DX, DY, BX, BY, BZ, STATE, SLOPE, P, Q = range(0, 11 * RAYS, RAYS)
 PX, PY, PZ, DZ, DEPTH = range(11 * RAYS, 16 * RAYS, RAYS)
 
 
-def optics(device: Device) -> Optics:
+def _optics(device: Device) -> Optics:
     """Return the numbers of a device's image side."""
     if isinstance(device.lens, Division):
         model, lens = DIVISION, [device.lens.kappa, 0, 0, 0, 0]
@@ -77,11 +99,13 @@ def geometry(rig: Rig) -> Geometry:
     """Prepare a rig for the kernels."""
     camera, projector = rig.camera, rig.projector
     return Geometry(
-        optics(camera), optics(projector), camera.position_m,
-        np.ascontiguousarray(camera.rotation.T),
-        projector.rotation @ camera.position_m + projector.translation_m,
-        np.ascontiguousarray(projector.rotation @ camera.rotation.T),
-    )  # fmt: skip
+        camera=_optics(camera),
+        projector=_optics(projector),
+        origin=camera.position_m,
+        world=np.ascontiguousarray(camera.rotation.T),
+        a=projector.rotation @ camera.position_m + projector.translation_m,
+        b=np.ascontiguousarray(projector.rotation @ camera.rotation.T),
+    )
 
 
 def ray_tile() -> Array:
@@ -90,7 +114,7 @@ def ray_tile() -> Array:
 
 
 @kernel(forceinline=True)
-def brown_forward(lens: Any, x: float, y: float) -> tuple[float, float, float, float, float]:
+def _brown_forward(lens: Array, x: float, y: float) -> tuple[float, float, float, float, float]:
     """Radial factor, tangential shifts, and derivatives dxd/dx, dyd/dx of OpenCV's model."""
     r2 = x * x + y * y
     radial = 1 + r2 * (lens[0] + r2 * (lens[1] + r2 * lens[4]))
@@ -101,7 +125,7 @@ def brown_forward(lens: Any, x: float, y: float) -> tuple[float, float, float, f
 
 
 @kernel()
-def _division_rays(o: Optics, u: Any, v: float, r: Array) -> None:
+def _division_rays(o: Optics, u: Columns, v: float, r: Array) -> None:
     kappa, dv = o.lens[0], v - o.cv
     cu, per_fx, y = o.cu, 1 / o.fx, dv / o.fy
     for k in range(u.size):
@@ -114,11 +138,19 @@ def _division_rays(o: Optics, u: Any, v: float, r: Array) -> None:
 
 
 @kernel()
-def brown_undistort(lens: Any, xd: float, yd: float) -> tuple[float, float]:
-    """Ideal slopes of observed ones, by fixed-point iteration."""
+def brown_undistort(lens: Array, xd: float, yd: float) -> tuple[float, float]:
+    """Ideal slopes of observed ones in OpenCV's model, by fixed-point iteration.
+
+    Parameters
+    ----------
+    lens : ndarray, (5,)
+        k1, k2, p1, p2, k3.
+    xd, yd : float
+        Observed slopes.
+    """
     x, y = xd, yd
     for _ in range(MAX_ITERATIONS):
-        radial, tx, ty, _, _ = brown_forward(lens, x, y)
+        radial, tx, ty, _, _ = _brown_forward(lens, x, y)
         last_x, last_y = x, y
         x, y = (xd - tx) / radial, (yd - ty) / radial
         if not abs(x - last_x) + abs(y - last_y) > EXACT:
@@ -127,18 +159,30 @@ def brown_undistort(lens: Any, xd: float, yd: float) -> tuple[float, float]:
 
 
 @kernel()
-def _brown_rays(o: Optics, u: Any, v: float, r: Array) -> None:
+def _brown_rays(o: Optics, u: Columns, v: float, r: Array) -> None:
     for k in range(u.size):
         x, y = brown_undistort(o.lens, (u[k] - o.cu) / o.fx, (v - o.cv) / o.fy)
-        radial, _, _, dxx, dyx = brown_forward(o.lens, x, y)
+        radial, _, _, dxx, dyx = _brown_forward(o.lens, x, y)
         r[X + k], r[Y + k] = x, y
         r[DX + k] = 1 / (dxx * o.fx)
         r[DY + k] = -dyx / (dxx * radial * o.fx)
 
 
 @kernel()
-def camera_rays(g: Geometry, u: Any, v: float, r: Array) -> None:
-    """Fill the rays of observed camera pixels (u, v): ideal slopes, derivatives along u."""
+def camera_rays(g: Geometry, u: Columns, v: float, r: Array) -> None:
+    """Fill the rays of camera pixels: ideal slopes, and their derivatives along u.
+
+    Parameters
+    ----------
+    g : Geometry
+        The rig.
+    u : ndarray, (n,)
+        Observed columns, at most RAYS.
+    v : float
+        Observed row.
+    r : ndarray
+        Tile of `ray_tile`; X to BZ are written.
+    """
     if g.camera.model == DIVISION:
         _division_rays(g.camera, u, v, r)
     else:
@@ -154,7 +198,7 @@ def camera_rays(g: Geometry, u: Any, v: float, r: Array) -> None:
 
 
 @kernel()
-def _division_slopes(g: Geometry, u_d: Any, r: Array) -> None:
+def _division_slopes(g: Geometry, u_d: Array, r: Array) -> None:
     """Slopes through the paper's lens, by Newton's method.
 
     The ideal row is linear in the slope, and the slope in h: ``dv h = p + q h`` with the observed
@@ -186,7 +230,7 @@ def _division_slopes(g: Geometry, u_d: Any, r: Array) -> None:
 
 
 @kernel()
-def _brown_slopes(g: Geometry, u_d: Any, r: Array) -> None:
+def _brown_slopes(g: Geometry, u_d: Array, r: Array) -> None:
     """Slopes through OpenCV's lens, by a fixed-point iteration."""
     a, o = g.a, g.projector
     for k in range(u_d.size):
@@ -198,7 +242,7 @@ def _brown_slopes(g: Geometry, u_d: Any, r: Array) -> None:
             over = last * a[2] - a[0]
             under = r[BX + k] - last * r[BZ + k]
             y = (a[1] * under + over * r[BY + k]) / (a[2] * under + over * r[BZ + k])
-            radial, tx, _, _, _ = brown_forward(o.lens, last, y)
+            radial, tx, _, _, _ = _brown_forward(o.lens, last, y)
             slope = ((u_d[k] - o.cu) / o.fx - tx) / radial
             moving += abs(slope - last) > SOLVED
             r[SLOPE + k] = slope
@@ -207,8 +251,18 @@ def _brown_slopes(g: Geometry, u_d: Any, r: Array) -> None:
 
 
 @kernel()
-def solve_slopes(g: Geometry, u_d: Any, r: Array) -> None:
-    """Fill SLOPE: the ideal slope X of each observed column, where the camera ray meets it."""
+def solve_slopes(g: Geometry, u_d: Array, r: Array) -> None:
+    """Fill SLOPE: the ideal slope X of each DMD column, where the camera ray meets it.
+
+    Parameters
+    ----------
+    g : Geometry
+        The rig.
+    u_d : ndarray, (n,)
+        Observed DMD columns, pixels.
+    r : ndarray
+        Tile with the rays of `camera_rays`.
+    """
     if g.projector.model == DIVISION:
         _division_slopes(g, u_d, r)
     else:
@@ -217,7 +271,17 @@ def solve_slopes(g: Geometry, u_d: Any, r: Array) -> None:
 
 @kernel()
 def solve_points(g: Geometry, n: int, r: Array) -> None:
-    """Fill the world points and dz/du; depth is not positive where no rays meet in front."""
+    """Fill the world points and dz/du; depth is not positive where no rays meet in front.
+
+    Parameters
+    ----------
+    g : Geometry
+        The rig.
+    n : int
+        Number of rays.
+    r : ndarray
+        Tile with rays and slopes; PX to DEPTH are written.
+    """
     a0, a2, b, w = g.a[0], g.a[2], g.b, g.world
     o0, o1, o2 = g.origin[0], g.origin[1], g.origin[2]
     b00, b01, b20, b21 = b[0, 0], b[0, 1], b[2, 0], b[2, 1]

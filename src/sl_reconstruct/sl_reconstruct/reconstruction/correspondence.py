@@ -9,22 +9,21 @@ thousandths of a pixel of noise.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_common.errors import SequenceError, StackError
 from sl_common.kernel_cache import kernel
+from sl_common.row_threads import share_rows
 from sl_projector.sequence.pattern_sequence import PatternSequence
 from sl_reconstruct.cloud.cloud import median
+from sl_reconstruct.decode.axis_decoder import AxisDecoder
 from sl_reconstruct.decode.decode_plan import DecodePlan
-from sl_reconstruct.decode.row_decoder import decode_rows, row_scratch
-from sl_reconstruct.decode.row_threads import share_rows
 from sl_reconstruct.decode.settings import Settings
-from sl_reconstruct.decode.stack_statistics import survey_rows
-from sl_reconstruct.decode.types import Lines
-from sl_reconstruct.reconstruction.reconstructor import empty_lines, make_layout, survey
+from sl_reconstruct.decode.stack_statistics import saturation_of
+from sl_reconstruct.decode.types import Floats, Lines, Pixels, contiguous
 
 Array = NDArray[np.float64]
 
@@ -62,7 +61,7 @@ class Correspondences:
 
 
 def correspondences(
-    stack: NDArray[np.uint8] | NDArray[np.uint16],
+    stack: Pixels,
     sequence: PatternSequence,
     step_px: int = 40,
     half_px: int = 12,
@@ -103,10 +102,10 @@ def correspondences(
     height, width = stack.shape[1:]
     grid = _grid(width, height, step_px, half_px)
     settings = settings or Settings()
-    columns = _lines(np.ascontiguousarray(stack), DecodePlan.of(sequence), settings)
+    columns = decode_columns(contiguous(stack), sequence, settings)
     column, sigma_c = _seen(columns, grid, half_px)
     images, flat = _rows_as_columns(stack, sequence)
-    rows = _lines(images, DecodePlan.of(flat), settings)
+    rows = decode_columns(images, flat, settings)
     row, sigma_r = _seen(rows, np.ascontiguousarray(grid[:, ::-1]), half_px)
     good = np.isfinite(column) & np.isfinite(row)
     return Correspondences(
@@ -115,6 +114,22 @@ def correspondences(
         np.stack([sigma_c[good], sigma_r[good]], axis=1),
         median(columns.sigma_px[columns.reason == 0]),
     )
+
+
+def decode_columns(stack: Pixels, sequence: PatternSequence, settings: Settings) -> Lines:
+    """Find all column boundaries along all image rows, as the reconstruction does.
+
+    Parameters
+    ----------
+    stack : ndarray, (N, H, W)
+        Images in pattern order.
+    sequence : PatternSequence
+        What was projected.
+    settings : Settings
+        How edges are found.
+    """
+    decoder = AxisDecoder(DecodePlan.of(sequence).column, settings)
+    return decoder(stack, saturation_of(stack, settings)).lines
 
 
 def _grid(width: int, height: int, step_px: int, half_px: int) -> Array:
@@ -128,44 +143,44 @@ def _grid(width: int, height: int, step_px: int, half_px: int) -> Array:
     return np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
 
 
-def _rows_as_columns(
-    stack: NDArray[Any], sequence: PatternSequence
-) -> tuple[NDArray[Any], PatternSequence]:
+def _rows_as_columns(stack: Pixels, sequence: PatternSequence) -> tuple[Pixels, PatternSequence]:
     """Turn images and patterns so that rows are decoded as columns are."""
     wanted = [i for i, p in enumerate(sequence.patterns) if p.kind != "gray" or p.axis == "row"]
     patterns = tuple(replace(sequence.patterns[i], axis="column") for i in wanted)
-    turned = np.ascontiguousarray(stack[wanted].transpose(0, 2, 1))
+    turned = contiguous(stack[wanted].transpose(0, 2, 1))
     return turned, PatternSequence(sequence.name, sequence.dmd_size[::-1], patterns)
 
 
-def _lines(stack: NDArray[Any], plan: DecodePlan, settings: Settings) -> Lines:
-    """All column boundaries along all image rows, as the reconstruction finds them."""
-    axis = plan.column
-    layout = make_layout(axis, plan.white, plan.black)
-    ys = survey_rows(stack.shape[1])
-    few = empty_lines(ys.size, axis)
-    tuning, edge_filter, bars, *_ = survey(stack, ys, axis, layout, settings, few)
-    lines = empty_lines(stack.shape[1], axis)
-    every = np.arange(stack.shape[1])
-    arguments = (stack, layout, edge_filter, tuning, bars, lines)
+class Patches(NamedTuple):
+    """What is found around the pixels of a grid, each (n,).
 
-    def work(first: int, last: int) -> None:
-        scratch = row_scratch(stack.shape[2], stack.dtype, -(-axis.size_px // axis.division_px))
-        decode_rows(every, first, last, *arguments, scratch)
+    Parameters
+    ----------
+    value : ndarray
+        DMD coordinate of the pixel, NaN where there is none.
+    sigma : ndarray
+        Its 1-sigma.
+    scatter : ndarray
+        Standard deviation of the boundaries about the fit, DMD pixels.
+    crossings : ndarray
+        Boundary crossings in the patch.
+    """
 
-    share_rows(work, every.size)
-    return lines
+    value: Array
+    sigma: Array
+    scatter: Array
+    crossings: NDArray[np.int64]
 
 
 def _seen(lines: Lines, grid: Array, half_px: int) -> tuple[Array, Array]:
     """DMD coordinate and its 1-sigma at pixels (along the line, line); NaN where there is none."""
-    value = np.full(len(grid), np.nan)
-    sigma = np.full(len(grid), np.nan)
-    scatter = np.full(len(grid), np.nan)
+    value, sigma, scatter = np.full((3, len(grid)), np.nan)
     count = np.zeros(len(grid), np.int64)
 
     def work(first: int, last: int) -> None:
-        _fit_patches(lines.u_px, grid, half_px, first, last, value, sigma, scatter, count)
+        here = slice(first, last)
+        part = Patches(value[here], sigma[here], scatter[here], count[here])
+        _fit_patches(lines.u_px, grid[here], half_px, part)
 
     share_rows(work, len(grid))
     full = np.median(count[count > 0]) if (count > 0).any() else 0
@@ -177,12 +192,9 @@ def _seen(lines: Lines, grid: Array, half_px: int) -> tuple[Array, Array]:
 
 
 @kernel()
-def _fit_patches(
-    lines_px: Any, grid: Any, half_px: int, first: int, last: int,
-    value: Any, sigma: Any, scatter: Any, count: Any,
-) -> None:  # fmt: skip
+def _fit_patches(lines_px: Floats, grid: Array, half_px: int, out: Patches) -> None:
     """Fit ``k - 0.5 = quadratic(du, dv)`` over each patch; its constant is what is wanted."""
-    for i in range(first, last):
+    for i in range(len(grid)):
         u, v = grid[i, 0], int(grid[i, 1])
         normal, right = np.zeros((_TERMS, _TERMS)), np.zeros(_TERMS)
         n, squares, reference = 0, 0.0, np.nan
@@ -202,13 +214,13 @@ def _fit_patches(
                         normal[a, b] += terms[a] * terms[b]
                 squares += c * c
                 n += 1
-        count[i] = n
+        out.crossings[i] = n
         if n < 4 * _TERMS:
             continue
         inverse = np.linalg.inv(normal + 1e-9 * np.eye(_TERMS))
         fit = inverse @ right
         rest = squares - fit @ right
         variance = (rest if rest > 0 else 0.0) / (n - _TERMS)
-        value[i] = reference + fit[0] - 0.5
-        scatter[i] = np.sqrt(variance)
-        sigma[i] = np.sqrt(variance * inverse[0, 0])
+        out.value[i] = reference + fit[0] - 0.5
+        out.scatter[i] = np.sqrt(variance)
+        out.sigma[i] = np.sqrt(variance * inverse[0, 0])

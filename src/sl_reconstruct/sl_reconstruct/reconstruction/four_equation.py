@@ -7,17 +7,35 @@ equations for three unknowns leave a residual: how far the two rays miss each ot
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sl_common.kernel_cache import kernel
 from sl_reconstruct.cloud.refusals import Reason
 from sl_reconstruct.decode.edges import PRESENT
-from sl_reconstruct.decode.types import Lines
-from sl_reconstruct.model.geometry import DIVISION, Geometry, Optics, brown_undistort
-from sl_reconstruct.reconstruction.triangulate import GEOMETRY, Around, Output, Screen, find_steps
+from sl_reconstruct.decode.types import Floats, Lines
+from sl_reconstruct.model.geometry import (
+    DEPTH,
+    DIVISION,
+    Array,
+    Geometry,
+    Optics,
+    brown_undistort,
+    camera_rays,
+    solve_points,
+    solve_slopes,
+)
+from sl_reconstruct.reconstruction.triangulate import (
+    GEOMETRY,
+    Around,
+    Output,
+    Scratch,
+    Screen,
+    Triangulation,
+    find_steps,
+    screen_row,
+)
 
 ROW = int(Reason.ROW)
 
@@ -25,22 +43,61 @@ ROW = int(Reason.ROW)
 MAX_GAP = 4
 
 
-class Crossed(NamedTuple):
-    """What rows add to a cloud: (H, K) DMD row, miss distances; ``v_map`` is (W, H) scratch."""
+class RowMap(NamedTuple):
+    """What a stack's row patterns say.
 
-    v_map: NDArray[np.float32]
-    v_px: NDArray[np.float32]
-    gap_m: NDArray[np.float32]
-    gap_px: NDArray[np.float32]
+    Parameters
+    ----------
+    v_map : ndarray, (W, H)
+        DMD row at every pixel, NaN where it is not known.
+    sigma_v : float
+        Its 1-sigma, DMD pixels: that of a typical row boundary.
+    max_gap_px : float
+        Points whose rays miss each other by more are refused.
+    """
+
+    v_map: Floats
+    sigma_v: float
+    max_gap_px: float
+
+
+class Crossed(NamedTuple):
+    """What rows add to a cloud, each (H, K): DMD row, miss of the rays, residual; NaN: none."""
+
+    v_px: Floats
+    gap_m: Floats
+    gap_px: Floats
+
+
+class Sight(NamedTuple):
+    """Where the two devices see a point: ideal slopes in camera and projector, and 1-sigma, px."""
+
+    x: float
+    y: float
+    px: float
+    py: float
+    sigma_u: float
+    sigma_v: float
 
 
 @kernel()
 def map_rows(
-    first: int, last: int, lines: Lines, screen: Screen, v_map: Any, around: Around
+    first: int, last: int, lines: Lines, screen: Screen, v_map: Floats, around: Around
 ) -> None:
-    """Fill the DMD row at the pixels of camera columns first to last; NaN where unknown.
+    """Interpolate the DMD row at the pixels of camera columns.
 
-    lines: row boundaries along camera columns, shape (W, DMD rows).
+    Parameters
+    ----------
+    first, last : int
+        Camera columns ``first:last``.
+    lines : Lines
+        Row boundaries along all camera columns.
+    screen : Screen
+        When a boundary is refused.
+    v_map : ndarray, (W, H)
+        Written to, NaN where the row is not known.
+    around : Around
+        Scratch.
     """
     for x in range(first, last):
         find_steps(lines.u_px, x, screen, around)
@@ -60,17 +117,18 @@ def map_rows(
 
 
 @kernel()
-def row_at(v_map: Any, u: float, y: int) -> Any:
+def _row_at(v_map: Floats, u: float, y: int) -> float:
     """DMD row at camera column u, linear between the columns beside it; NaN where unknown."""
     x = int(np.floor(u))
     if not 0 <= x < v_map.shape[0] - 1:
         return np.nan
     w = u - x
-    return (1 - w) * v_map[x, y] + w * v_map[x + 1, y]
+    between: float = (1 - w) * v_map[x, y] + w * v_map[x + 1, y]
+    return between
 
 
 @kernel()
-def undistorted(o: Optics, u: float, v: float) -> Any:
+def _undistorted(o: Optics, u: float, v: float) -> tuple[float, float]:
     """Ideal slopes of an observed image point."""
     x, y = (u - o.cu) / o.fx, (v - o.cv) / o.fy
     if o.model == DIVISION:
@@ -80,15 +138,26 @@ def undistorted(o: Optics, u: float, v: float) -> Any:
 
 
 @kernel()
-def solve_four(
-    g: Geometry, x: float, y: float, px: float, py: float, sigma_u: float, sigma_v: float, out: Any
-) -> Any:
+def solve_four(g: Geometry, at: Sight, out: Array) -> bool:
     """Least squares over Eqs. (3) and (4), each weighted to pixels.
 
-    x, y and px, py are ideal slopes in camera and projector. Writes to ``out``: world point,
-    sigma of z, miss distance in metres, root sum of squared residuals in pixels. False where
-    the rays do not meet in front of both devices.
+    Parameters
+    ----------
+    g : Geometry
+        The rig.
+    at : Sight
+        Where it sees the point.
+    out : ndarray, (6,)
+        Written to: world point, sigma of z, distance of the rays (metres), root sum of squared
+        residuals (pixels).
+
+    Returns
+    -------
+    bool
+        False where the rays do not meet in front of both devices; then only the distance is
+        written.
     """
+    x, y, px, py = at.x, at.y, at.px, at.py
     a, b = g.a, g.b
     bx = b[0, 0] * x + b[0, 1] * y + b[0, 2]
     bz = b[2, 0] * x + b[2, 1] * y + b[2, 2]
@@ -111,53 +180,80 @@ def solve_four(
     r = j @ p + c
     to_z = g.world[2] @ inverse
     out[:3] = g.origin + g.world @ p
-    out[3] = np.sqrt((to_z[0] * sigma_u) ** 2 + (to_z[3] * sigma_v) ** 2)
+    out[3] = np.sqrt((to_z[0] * at.sigma_u) ** 2 + (to_z[3] * at.sigma_v) ** 2)
     out[5] = np.sqrt(np.sum(r * r))
-    return p[2] > 0
+    return bool(p[2] > 0)
 
 
 @kernel()
-def miss_m(between: Any, ray: Any, other: Any) -> Any:
-    """Shortest distance of two lines, given the vector between their origins."""
+def miss_m(between: Array, ray: Array, other: Array) -> float:
+    """Shortest distance of two lines.
+
+    Parameters
+    ----------
+    between : ndarray, (3,)
+        From the origin of one to that of the other, metres.
+    ray, other : ndarray, (3,)
+        Their directions, of any length.
+    """
     n = np.cross(ray, other)
-    return abs(np.dot(between, n)) / np.sqrt(np.dot(n, n))
+    distance: float = abs(np.dot(between, n)) / np.sqrt(np.dot(n, n))
+    return distance
+
+
+@kernel()
+def _meets(g: Geometry, u: Floats, v: float, column: Array, r: Array) -> bool:
+    """Whether a camera ray meets a DMD column, one of each, in front of both devices."""
+    camera_rays(g, u, v, r)
+    solve_slopes(g, column, r)
+    solve_points(g, 1, r)
+    return bool(r[DEPTH] > 0)
 
 
 @kernel()
 def cross_rows(
-    first: int, last: int, g: Geometry, columns: Any, lines: Lines, sigma_v: float,
-    max_gap_px: float, out: Output, add: Crossed,
-) -> None:  # fmt: skip
-    """Solve all four equations where a point of rows first to last has a DMD row.
+    job: Triangulation, rows: RowMap, first: int, last: int, out: Output, add: Crossed, s: Scratch
+) -> None:
+    """Screen rows and triangulate them from columns and DMD rows, by all four equations.
 
-    Points without one are refused: three equations may leave depth all but free, as where the
-    devices lie above each other.
+    Points without a DMD row are refused: three equations may leave depth all but free, as where
+    the devices lie above each other. Of a point's sigma, the column's part is widened by bends and
+    uneven light; the row's part is that of a typical row boundary by noise (docs/measure.md).
+
+    Parameters
+    ----------
+    job, first, last, out, s
+        As in `triangulate_rows`.
+    rows : RowMap
+        Has the DMD rows.
+    add : Crossed
+        Written to.
     """
-    answer = np.zeros(6)
+    g, columns, u_px, reason, answer = job.geometry, job.columns, out.u_px, out.reason, np.zeros(6)
     for y in range(first, last):
-        add.gap_m[y], add.gap_px[y] = np.nan, np.nan
+        screen_row(job, y, out, s)
+        out.values[y] = np.nan
+        add.v_px[y], add.gap_m[y], add.gap_px[y] = np.nan, np.nan, np.nan
         for k in range(columns.size):
-            v, u = np.nan, lines.u_px[y, k]
-            if out.reason[y, k] == PRESENT or out.reason[y, k] == GEOMETRY:
-                v = row_at(add.v_map, u, y)
-            add.v_px[y, k] = v
-            if np.isnan(v):
-                if out.reason[y, k] == PRESENT:
-                    out.values[y, k], out.reason[y, k] = np.nan, ROW
+            if reason[y, k] != PRESENT:
                 continue
-            cx, cy = undistorted(g.camera, u, float(y))
-            px, py = undistorted(g.projector, columns[k], v)
+            v = _row_at(rows.v_map, u_px[y, k], y)
+            if np.isnan(v):
+                if _meets(g, u_px[y, k : k + 1], float(y), columns[k : k + 1], s.rays):
+                    reason[y, k] = ROW
+                else:
+                    reason[y, k], u_px[y, k] = GEOMETRY, np.nan
+                continue
+            seen = _undistorted(g.camera, u_px[y, k], float(y))
+            lit = _undistorted(g.projector, columns[k], v)
             answer[5] = np.nan
-            met = solve_four(g, cx, cy, px, py, lines.sigma_px[y, k], sigma_v, answer)
-            add.gap_m[y, k], add.gap_px[y, k] = answer[4], answer[5]
-            if met and answer[5] <= max_gap_px:
+            sight = Sight(seen[0], seen[1], lit[0], lit[1], s.sigma_px[k], rows.sigma_v)
+            met = solve_four(g, sight, answer)
+            add.v_px[y, k], add.gap_m[y, k], add.gap_px[y, k] = v, answer[4], answer[5]
+            if met and answer[5] <= rows.max_gap_px:
                 for i in range(3):
                     out.values[y, k, i] = answer[i]
-                out.values[y, k, 3] = lines.level_dn[y, k]
+                out.values[y, k, 3] = job.lines.level_dn[y, k]
                 out.values[y, k, 4] = answer[3]
-                out.u_px[y, k] = u
-                out.reason[y, k] = PRESENT
             else:
-                out.values[y, k] = np.nan
-                out.reason[y, k] = GEOMETRY
-                out.u_px[y, k] = np.nan
+                reason[y, k], u_px[y, k] = GEOMETRY, np.nan

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sl_common.kernel_cache import kernel
 from sl_reconstruct.cloud.refusals import Reason
 from sl_reconstruct.decode.edge_uncertainty import widen_edges
 from sl_reconstruct.decode.edges import PRESENT, Tuning
+from sl_reconstruct.decode.types import Bytes, Floats, Lines, line_at
 from sl_reconstruct.model.geometry import (
     DEPTH,
     DZ,
@@ -21,6 +21,7 @@ from sl_reconstruct.model.geometry import (
     Array,
     Geometry,
     camera_rays,
+    ray_tile,
     solve_points,
     solve_slopes,
 )
@@ -28,25 +29,39 @@ from sl_reconstruct.model.geometry import (
 STEP = int(Reason.STEP)
 GEOMETRY = int(Reason.GEOMETRY)
 
-#: A boundary may move from row to row by so many times the jump that makes a step.
+#: A boundary may move from row to row by this many times the jump that makes a step.
 ROW_JUMP = 2.0
 #: Boundaries over which a neighbour may be looked for.
 NEIGHBOURS = 8
 
 
 class Output(NamedTuple):
-    """Where a cloud is written: (H, K, 5) values, (H, K) columns and reasons."""
+    """Where a cloud is written.
 
-    values: NDArray[np.float32]
-    u_px: NDArray[np.float32]
-    reason: NDArray[np.uint8]
+    Parameters
+    ----------
+    values : ndarray, (H, K, 5)
+        World x, y, z, level and sigma; NaN where there is no point.
+    u_px : ndarray, (H, K)
+        Camera column of each boundary.
+    reason : ndarray, (H, K)
+        Why there is no point.
+    """
+
+    values: Floats
+    u_px: Floats
+    reason: Bytes
 
 
 class Screen(NamedTuple):
     """When neighbours say that a depth step lies under an edge.
 
-    ``jump_px``: an edge may lie so far from where two neighbours lead, camera pixels.
-    ``near_px``: signed least distance to the next boundary, ``wide_px`` of those on both sides.
+    Parameters
+    ----------
+    jump_px : float
+        An edge may lie this far from where two neighbours lead, camera pixels.
+    near_px, wide_px : float
+        Least distance to the next boundary, and between those on both sides; signed.
     """
 
     jump_px: float
@@ -57,8 +72,40 @@ class Screen(NamedTuple):
 class Around(NamedTuple):
     """Scratch for one row: it and two rows on either side, with two NaN at both ends; marks."""
 
-    rows: NDArray[np.float32]
-    bad: NDArray[np.uint8]
+    rows: Floats
+    bad: Bytes
+
+
+class Triangulation(NamedTuple):
+    """What the rows of a cloud are made from.
+
+    Parameters
+    ----------
+    geometry : Geometry
+        The rig.
+    columns : ndarray, (K,)
+        Observed DMD column of each boundary.
+    lines : Lines
+        Boundaries along every camera row.
+    screen : Screen
+        When a boundary is refused.
+    tuning : Tuning
+        What ``lines`` were decoded with.
+    """
+
+    geometry: Geometry
+    columns: Array
+    lines: Lines
+    screen: Screen
+    tuning: Tuning
+
+
+class Scratch(NamedTuple):
+    """Scratch of one thread: solved rays, neighbours of a row, and its sigma, camera pixels."""
+
+    rays: Array
+    around: Around
+    sigma_px: Floats
 
 
 def around_row(n: int) -> Around:
@@ -66,8 +113,13 @@ def around_row(n: int) -> Around:
     return Around(np.full((5, n + 4), np.nan, np.float32), np.zeros(n, np.uint8))
 
 
+def triangulation_scratch(n: int) -> Scratch:
+    """Return scratch for rows of n boundaries."""
+    return Scratch(ray_tile(), around_row(n), np.zeros(n, np.float32))
+
+
 @kernel()
-def _compare(rows: Any, y: int, height: int, s: Screen, bad: Any) -> None:
+def _compare(rows: Floats, y: int, height: int, s: Screen, bad: Bytes) -> None:
     """Mark a row's boundaries that are not where others lead: 1 is bad, 2 has few neighbours.
 
     Bad is what lies off the line through two neighbours on a side, in the row or the column; what
@@ -102,7 +154,7 @@ def _compare(rows: Any, y: int, height: int, s: Screen, bad: Any) -> None:
 
 
 @kernel(forceinline=True)
-def _side(u: Any, k: int, step: int) -> tuple[float, float, int]:
+def _side(u: Floats, k: int, step: int) -> tuple[float, float, int]:
     """Where the next two present boundaries on a side lead, distance per boundary, their number."""
     first = -1
     pace = 0.0
@@ -119,7 +171,7 @@ def _side(u: Any, k: int, step: int) -> tuple[float, float, int]:
 
 
 @kernel()
-def _lonely(u: Any, s: Screen, bad: Any) -> None:
+def _lonely(u: Floats, s: Screen, bad: Bytes) -> None:
     """Check boundaries without near neighbours against farther ones; alone, they are refused."""
     n = u.size
     sign, near = 1.0 if s.near_px > 0 else -1.0, abs(s.near_px)
@@ -139,8 +191,20 @@ def _lonely(u: Any, s: Screen, bad: Any) -> None:
 
 
 @kernel(forceinline=True)
-def find_steps(u_px: Any, y: int, s: Screen, around: Around) -> None:
-    """Mark boundaries of row y that are not where their neighbours in row and column lead."""
+def find_steps(u_px: Floats, y: int, s: Screen, around: Around) -> None:
+    """Mark boundaries of a row that are not where their neighbours in row and column lead.
+
+    Parameters
+    ----------
+    u_px : ndarray, (H, K)
+        Columns of all boundaries.
+    y : int
+        The row.
+    s : Screen
+        The limits.
+    around : Around
+        Its ``bad`` is written: 1 where a boundary is refused.
+    """
     height, n = u_px.shape
     for i in range(5):
         row = around.rows[i, 2 : n + 2]
@@ -155,9 +219,35 @@ def find_steps(u_px: Any, y: int, s: Screen, around: Around) -> None:
 
 
 @kernel(forceinline=True)
-def _write(r: Array, sigma_px: Any, level: Any, values: Any, u: Any, reason: Any) -> None:
+def screen_row(job: Triangulation, y: int, out: Output, s: Scratch) -> None:
+    """Write a row's columns, reasons and sigma as its neighbours leave them.
+
+    Parameters
+    ----------
+    job : Triangulation
+        The boundaries.
+    y : int
+        The row.
+    out : Output
+        Its ``u_px`` and ``reason`` are written.
+    s : Scratch
+        Its ``sigma_px`` is written: the lines' own says what noise does, to which comes what
+        bends and uneven light do.
+    """
+    lines, bad, nan = job.lines, s.around.bad, np.float32(np.nan)
+    line = line_at(lines, y)
+    widen_edges(job.tuning, line, s.sigma_px)
+    find_steps(lines.u_px, y, job.screen, s.around)
+    u, reason, at, found = out.u_px[y], out.reason[y], line.u_px, line.reason
+    for k in range(u.size):
+        u[k] = nan if bad[k] else at[k]
+        reason[k] = np.uint8(STEP) if (bad[k] != 0) & (found[k] == PRESENT) else found[k]
+
+
+@kernel(forceinline=True)
+def _write(r: Array, sigma_px: Floats, level: Floats, row: Output) -> None:
     """Write the solved part of a row; NaN where there is no point."""
-    nan = np.float32(np.nan)
+    values, u, reason, nan = row.values, row.u_px, row.reason, np.float32(np.nan)
     for k in range(u.size):
         if reason[k] == PRESENT and r[DEPTH + k] > 0:
             values[k, 0] = r[PX + k]
@@ -173,37 +263,28 @@ def _write(r: Array, sigma_px: Any, level: Any, values: Any, u: Any, reason: Any
             values[k, i] = nan
 
 
-@kernel(forceinline=True)
-def _row(g: Geometry, y: int, columns: Any, lines: Any, bad: Any, r: Array, out: Output) -> None:
-    u, reason, values = out.u_px[y], out.reason[y], out.values[y]
-    found, sigma_px, level, at = (
-        lines.reason[y],
-        lines.sigma_px[y],
-        lines.level_dn[y],
-        lines.u_px[y],
-    )
-    nan = np.float32(np.nan)
-    for k in range(u.size):
-        u[k] = nan if bad[k] else at[k]
-        reason[k] = np.uint8(STEP) if (bad[k] != 0) & (found[k] == PRESENT) else found[k]
-    for a in range(0, u.size, RAYS):
-        b = min(a + RAYS, u.size)
-        camera_rays(g, u[a:b], float(y), r)
-        solve_slopes(g, columns[a:b], r)
-        solve_points(g, b - a, r)
-        _write(r, sigma_px[a:b], level[a:b], values[a:b], u[a:b], reason[a:b])
-
-
 @kernel()
-def triangulate_rows(
-    first: int, last: int, g: Geometry, columns: Any, lines: Any, screen: Screen, t: Tuning,
-    out: Output, r: Array, around: Around,
-) -> None:  # fmt: skip
-    """Screen and triangulate rows first to last. columns: observed DMD column of each boundary.
+def triangulate_rows(job: Triangulation, first: int, last: int, out: Output, s: Scratch) -> None:
+    """Screen rows and triangulate them from their columns alone, by three equations.
 
-    Widens the lines' sigma, which says what noise does, by what bends and uneven light do.
+    Parameters
+    ----------
+    job : Triangulation
+        What they are made from.
+    first, last : int
+        Rows ``first:last``.
+    out : Output
+        The cloud, written to.
+    s : Scratch
+        Made by `triangulation_scratch`, one for each thread.
     """
+    r, g, level = s.rays, job.geometry, job.lines.level_dn
     for y in range(first, last):
-        widen_edges(t, lines.u_px[y], lines.level_dn[y], lines.sigma_px[y])
-        find_steps(lines.u_px, y, screen, around)
-        _row(g, y, columns, lines, around.bad, r, out)
+        screen_row(job, y, out, s)
+        u, reason, values = out.u_px[y], out.reason[y], out.values[y]
+        for a in range(0, u.size, RAYS):
+            b = min(a + RAYS, u.size)
+            camera_rays(g, u[a:b], float(y), r)
+            solve_slopes(g, job.columns[a:b], r)
+            solve_points(g, b - a, r)
+            _write(r, s.sigma_px[a:b], level[y, a:b], Output(values[a:b], u[a:b], reason[a:b]))

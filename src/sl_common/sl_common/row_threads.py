@@ -23,7 +23,7 @@ def share_rows(work: Callable[[int, int], None], rows: int) -> None:
     Returns when all are done; raises what any of them raised. Rows must not depend on each
     other, then the result does not depend on the number of cores.
     """
-    parts = min(rows, PARTS * len(os.sched_getaffinity(0)))
+    parts = max(1, min(rows, PARTS * len(os.sched_getaffinity(0))))
     bounds = [rows * i // parts for i in range(parts + 1)]
     for done in [_pool().submit(work, a, b) for a, b in pairwise(bounds)]:
         done.result()
