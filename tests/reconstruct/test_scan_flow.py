@@ -17,7 +17,7 @@ from sl_reconstruct.scan.scan_flow import (
     ScanWatch,
 )
 
-SHORT = ScanTimeouts(project_s=0.2, silence_s=0.2, reconstruct_s=0.2)
+SHORT = ScanTimeouts(0.2, 0.2, 0.2)
 Script = Callable[[ScanWatch], None]
 
 
@@ -34,7 +34,7 @@ class FakeGear:
         self.begun += 1
         return ScanWatch(100 + self.begun)
 
-    def project(self, watch: ScanWatch, order: ScanRequest) -> None:
+    def project(self, watch: ScanWatch, request: ScanRequest) -> None:
         self.scripts.pop(0)(watch)
 
     def stop_projecting(self) -> None:
@@ -177,7 +177,7 @@ def test_cancel_ends_every_wait_and_stops_the_projector() -> None:
 
 def test_nobody_to_ask_is_an_answer() -> None:
     class Deaf(FakeGear):
-        def project(self, watch: ScanWatch, order: ScanRequest) -> None:
+        def project(self, watch: ScanWatch, request: ScanRequest) -> None:
             raise ScanFailed("the projector cannot be asked")
 
     result, _ = run(Deaf())

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from geometry_msgs.msg import Point
@@ -32,6 +33,25 @@ REST_S = 2.0
 _DISCOVERY_S = 10.0
 
 
+@dataclass(frozen=True)
+class AcquisitionSettings:
+    """How views are taken.
+
+    Parameters
+    ----------
+    max_repeats : int
+        How often a spoilt stack is repeated.
+    move_timeout_s : float
+        Longest move of the stage.
+    settle_s : float
+        Rest after a move before anything is exposed.
+    """
+
+    max_repeats: int = 4
+    move_timeout_s: float = 120.0
+    settle_s: float = 0.2
+
+
 class GraphDevices:
     """Drives stage and projector by their services and listens to the synchroniser.
 
@@ -41,19 +61,21 @@ class GraphDevices:
     ----------
     node : RigNode
         Whose clients and subscriptions these are.
+    settings : AcquisitionSettings
+        Patience with the stage, and with spoilt stacks.
+    timeouts : ScanTimeouts
+        Patience with each stack.
     """
 
-    def __init__(self, node: RigNode) -> None:
-        self._node = node
+    def __init__(
+        self, node: RigNode, settings: AcquisitionSettings, timeouts: ScanTimeouts
+    ) -> None:
+        self._node, self._settings, self._timeouts = node, settings, timeouts
         self._move = node.client(topics.MOVE_STAGE)
         self._stop_stage = node.client(topics.STOP_STAGE)
         self._stacks = StackClient(node)
         self._cancelled: Callable[[], bool] = lambda: False
         self._pose_ns = 0
-        self.move_timeout_s = 120.0
-        self.settle_s = 0.2
-        self.max_repeats = 2
-        self.timeouts = ScanTimeouts()
 
     @contextmanager
     def in_use(self, cancelled: Callable[[], bool]) -> Iterator[GraphDevices]:
@@ -122,8 +144,8 @@ class GraphDevices:
         move would make the synchroniser believe that the stage moved meanwhile.
         """
         reply = self._ask(place)
-        settled_ns = stamp_from_msg(reply.pose.header.stamp) + round(self.settle_s * 1e9)
-        end_s = time.monotonic() + self.settle_s + _ANSWER_S
+        settled_ns = stamp_from_msg(reply.pose.header.stamp) + round(self._settings.settle_s * 1e9)
+        end_s = time.monotonic() + self._settings.settle_s + _ANSWER_S
         while self._pose_ns < settled_ns:
             if time.monotonic() > end_s:
                 raise DeviceTimeout(f"{topics.POSE.name} is silent: is the stage node running?")
@@ -141,7 +163,7 @@ class GraphDevices:
         request = self._move.srv_type.Request(
             target=Point(x=x, y=y, z=z), relative=relative, check_only=check_only
         )
-        patience_s = _ANSWER_S if check_only else self.move_timeout_s
+        patience_s = _ANSWER_S if check_only else self._settings.move_timeout_s
         reply = self._answer(self._move.call_async(request), patience_s, topics.MOVE_STAGE.name)
         if not reply.success:
             raise DeviceError(reply.message)
@@ -167,8 +189,8 @@ class GraphDevices:
 
     def take(self, sequence: str) -> Stack:
         """Project a sequence; spoilt attempts are repeated."""
-        request = ScanRequest(sequence, 0.0, self.max_repeats, REST_S)
-        result = self._stacks.take(request, lambda _: None, self._cancelled, self.timeouts)
+        request = ScanRequest(sequence, 0.0, self._settings.max_repeats, REST_S)
+        result = self._stacks.take(request, lambda _: None, self._cancelled, self._timeouts)
         if result.cancelled:
             raise RunCancelled("calibration cancelled")
         if not result.success:

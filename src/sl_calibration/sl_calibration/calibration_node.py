@@ -19,7 +19,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
 
-from sl_calibration.acquisition_node import GraphDevices
+from sl_calibration.acquisition_node import AcquisitionSettings, GraphDevices
 from sl_calibration.data.run_store import Store, default_directory
 from sl_calibration.data.session import CalibrationProgress, CalibrationRequest
 from sl_calibration.solve.acceptance import Limits
@@ -41,6 +41,18 @@ _LimitsT = TypeVar("_LimitsT", Limits, VerifyLimits)
 NOT_CALIBRATED = "not calibrated"
 #: A calibration file that is not there yet, or is not whole, is looked for again after this.
 RETRY_S = 1.0
+_ACQUISITION = {
+    "max_repeats": ("how often a spoilt stack is repeated", 0, 9),
+    "move_timeout_s": ("wait for the stage, s", 1.0, 3600.0),
+    "settle_s": ("rest after a move before anything is exposed, s", 0.0, 60.0),
+}
+_TIMEOUTS = {
+    "project_timeout_s": ("wait for the projector, s", 1.0, 3600.0),
+    "silence_timeout_s": ("wait for the next frame, s", 0.1, 600.0),
+}
+_MARK = "diameter of the one hole that marks the origin, m; 0: no mark"
+_TRAVEL = "x and y travel of two views that tell squareness; 0: none, m"
+_FILE = "in force at the start; empty: the last accepted in store_dir"
 _HEIGHTS_M = [-1e-3, -0.5e-3, 0.0, 0.5e-3, 1e-3]
 
 
@@ -51,11 +63,6 @@ class CalibrationNode(RigNode):
         super().__init__("calibration", **options)
         self._declare_parameters()
         self._calibrator = self._make_calibrator()
-        self._gear = GraphDevices(self)
-        self._gear.timeouts = self._timeouts
-        self._gear.max_repeats = self._repeats
-        self._gear.move_timeout_s = self._move_timeout_s
-        self._gear.settle_s = self._settle_s
         self._running = threading.Lock()
         self._in_force: Calibration | None = None
         self._source = ""
@@ -74,14 +81,9 @@ class CalibrationNode(RigNode):
     # -- parameters -----------------------------------------------------------------------------
 
     def _declare_parameters(self) -> None:
-        self._store = Store(Path(
-            self.declare("store_dir", "", "folder of calibrations; empty: the user's")
-            or default_directory()
-        ).expanduser())  # fmt: skip
-        self._file = self.declare(
-            "calibration_file", "", "in force at the start; empty: the last accepted in store_dir",
-            live=True,
-        )  # fmt: skip
+        folder = self.declare("store_dir", "", "folder of calibrations; empty: the user's")
+        self._store = Store(Path(folder or default_directory()).expanduser())
+        self._file = self.declare("calibration_file", "", _FILE, live=True)
         self.declare("heights_m", _HEIGHTS_M, "stage heights of the views, m", live=True)
         self.declare("sequence", "precise-rows", "patterns, both axes", live=True)
         self._declare_plate()
@@ -92,62 +94,33 @@ class CalibrationNode(RigNode):
         self._stage_tolerance_m = self.declare(
             "stage_tolerance_m", 5e-6, "the stage stands where it was sent within, m", 1e-7, 1e-3
         )
-        self._repeats = self.declare("max_repeats", 4, "how often a spoilt stack is repeated", 0, 9)
-        self._travel_m = self.declare(
-            "travel_m", 0.5e-3, "x and y travel of two views that tell squareness; 0: none, m",
-            0.0, 0.1,
-        )  # fmt: skip
+        self._travel_m = self.declare("travel_m", 0.5e-3, _TRAVEL, 0.0, 0.1)
         self._limits = self._declare_limits(Limits(), "limit", "acceptance")
         self._verify_limits = self._declare_limits(VerifyLimits(), "verify_limit", "verify")
-        self._declare_timeouts()
+        settings = self.declare_fields(AcquisitionSettings(), _ACQUISITION)
+        timeouts = self.declare_fields(ScanTimeouts(), _TIMEOUTS)
+        self._devices = GraphDevices(self, settings, timeouts)
 
     def _declare_plate(self) -> None:
         plate = DEFAULT_PLATE
-        self.declare("plate_columns", plate.columns, "holes along x", 3, 200, live=True)
-        self.declare("plate_rows", plate.rows, "holes along y", 3, 200, live=True)
-        self.declare("plate_pitch_m", plate.pitch_m, "pitch of the holes, m", 0.0, 1.0, live=True)
-        self.declare(
-            "plate_diameter_m", plate.diameter_m, "diameter of the holes, m", 0.0, 1.0, live=True
-        )
-        self.declare(
-            "plate_origin_diameter_m", plate.origin_diameter_m or 0.0,
-            "diameter of the one hole that marks the origin, m; 0: no mark", 0.0, 1.0, live=True,
-        )  # fmt: skip
-        for name, value in zip(("column", "row"), plate.origin_id, strict=True):
-            self.declare(f"plate_origin_{name}", value, f"{name} of the mark", 0, 199, live=True)
-        self.declare("plate_chamfer_m", 0.0, "width of the holes' chamfers, m", 0.0, 1.0, live=True)
-        self.declare(
-            "plate_dark_holes", True, "dark holes in a bright plate; false: bright dots", live=True
-        )
+        for name, value, text, *span in (
+            ("columns", plate.columns, "holes along x", 3, 200),
+            ("rows", plate.rows, "holes along y", 3, 200),
+            ("pitch_m", plate.pitch_m, "pitch of the holes, m", 0.0, 1.0),
+            ("diameter_m", plate.diameter_m, "diameter of the holes, m", 0.0, 1.0),
+            ("origin_diameter_m", plate.origin_diameter_m or 0.0, _MARK, 0.0, 1.0),
+            ("origin_column", plate.origin_id[0], "column of the mark", 0, 199),
+            ("origin_row", plate.origin_id[1], "row of the mark", 0, 199),
+            ("chamfer_m", 0.0, "width of the holes' chamfers, m", 0.0, 1.0),
+            ("dark_holes", True, "dark holes in a bright plate; false: bright dots"),
+        ):
+            low, high = span or (None, None)
+            self.declare(f"plate_{name}", value, text, low, high, live=True)
 
     def _declare_limits(self, default: _LimitsT, prefix: str, what: str) -> _LimitsT:
         """Limits of acceptance or of a check, each a parameter of its own."""
-        values = {
-            item.name: self.declare(
-                f"{prefix}_{item.name}",
-                float(getattr(default, item.name)),
-                f"{what}: largest {item.name}",
-            )
-            for item in fields(default)
-        }
-        return type(default)(**values)
-
-    def _declare_timeouts(self) -> None:
-        default = ScanTimeouts()
-        self._timeouts = ScanTimeouts(
-            project_s=self.declare(
-                "project_timeout_s", default.project_s, "wait for the projector, s", 1.0, 3600.0
-            ),
-            silence_s=self.declare(
-                "silence_timeout_s", default.silence_s, "wait for the next frame, s", 0.1, 600.0
-            ),
-        )
-        self._move_timeout_s = self.declare(
-            "move_timeout_s", 120.0, "wait for the stage, s", 1.0, 3600.0
-        )
-        self._settle_s = self.declare(
-            "settle_s", 0.2, "rest after a move before anything is exposed, s", 0.0, 60.0
-        )
+        about = {item.name: (f"{what}: largest {item.name}",) for item in fields(default)}
+        return self.declare_fields(default, about, f"{prefix}_")
 
     def _value(self, name: str) -> Any:
         return self.get_parameter(name).value
@@ -233,9 +206,9 @@ class CalibrationNode(RigNode):
         def work() -> Outcome:
             order = self._order(request)
             self._await_compiler(cancelled)
-            with self._gear.in_use(cancelled) as gear:
+            with self._devices.in_use(cancelled) as devices:
                 return self._calibrator.calibrate(
-                    gear, order, self._stands(), tell, str(request.keep)
+                    devices, order, self._stands(), tell, str(request.keep)
                 )
 
         outcome: Outcome = self._alone(work, Outcome)
@@ -306,8 +279,8 @@ class CalibrationNode(RigNode):
             if in_force is None:
                 raise CalibrationError(f"nothing to verify: {self._fault or NOT_CALIBRATED}")
             self._await_compiler(self.shutting_down)
-            with self._gear.in_use(self.shutting_down) as gear:
-                return self._calibrator.verify(gear, asked, in_force)
+            with self._devices.in_use(self.shutting_down) as devices:
+                return self._calibrator.verify(devices, asked, in_force)
 
         outcome = await self.in_worker(lambda: self._alone(work, VerifyOutcome))
         for item in fields(VerifyOutcome):

@@ -76,7 +76,7 @@ class CameraNode(RigNode):
         )
         if self._settings.trigger == "software":
             self.listen(topics.TRIGGER, self._on_trigger)
-        self.serve(topics.TRIGGER_CAMERA, self._trigger)
+        self.serve_work(topics.TRIGGER_CAMERA, self._trigger)
         self.add_on_set_parameters_callback(self._on_parameters)
         self._link = DeviceLink("camera", self._connect, self.say)
         self._link.start()
@@ -224,13 +224,9 @@ class CameraNode(RigNode):
             self._windows.withdraw(window)
             raise
 
-    def _trigger(self, _request: Any, response: Any) -> Any:
-        try:
-            self._link.device().software_trigger()
-            response.success, response.message = True, "triggered"
-        except SlError as error:
-            response.success, response.message = False, str(error)
-        return response
+    def _trigger(self, _request: Any, response: Any) -> None:
+        self._link.device().software_trigger()
+        response.success, response.message = True, "triggered"
 
     def _on_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         changes = {p.name: p.value for p in parameters if p.name in _LIVE}

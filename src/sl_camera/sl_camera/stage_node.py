@@ -199,25 +199,14 @@ class StageNode(RigNode):
     def _serve(
         self, service: topics.Service, work: Callable[[StageDriver, Any, Any], None]
     ) -> None:
-        """Offer a service whose work blocks; what goes wrong becomes its answer."""
+        def do(request: Any, response: Any) -> None:
+            work(self._link.device(), request, response)
 
-        async def handle(request: Any, response: Any) -> Any:
-            def do() -> None:
-                work(self._link.device(), request, response)
+        def failed(error: SlError) -> None:
+            self.note(f"{service.name} failed: {error}")
+            self._notice(error)
 
-            try:
-                await self.in_worker(do)
-            except SlError as error:
-                response.success, response.message = False, str(error)
-                self.get_logger().error(f"{service.name} failed: {error}")
-                self.note(f"{service.name} failed: {error}")
-                self._notice(error)
-            except Exception as error:  # the caller gets an answer whatever happens
-                response.success, response.message = False, f"internal fault: {error!r}"
-                self.get_logger().error(f"{service.name} failed: {error!r}")
-            return response
-
-        self.serve(service, handle)
+        self.serve_work(service, do, failed)
 
     def _notice(self, error: SlError) -> None:
         """A service that lost the device leaves it to be opened anew."""

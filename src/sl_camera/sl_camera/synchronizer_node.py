@@ -20,13 +20,28 @@ from sl_projector.sequence.stack import Stack
 #: While a scan is open, time-outs and the settling time are looked at so often.
 TICK_S = 0.004
 
+_PARAMETERS = {
+    "tolerance_fraction": ("image and trigger stamps may differ by this part of a period",),
+    "jitter_fraction": ("scatter of these differences in a scan, part of a period",),
+    "clock_offset_s": ("known constant camera stamp minus projector stamp, s",),
+    "settle_s": ("wait so long after the last image for a surplus one, s",),
+    "timeout_s": ("give a scan up when so long nothing came that was due, s",),
+    "early_image_s": ("keep an image so long whose trigger did not come yet, s",),
+    "require_pose": ("refuse scans without stage poses before and after them",),
+    "pose_max_age_s": ("the pose before the first exposure may be so old, s",),
+    "position_tolerance_m": ("the part stood still when its poses agree so well, m",),
+    "rotation_tolerance_rad": ("the part stood still when its poses agree so well, rad",),
+    "max_patterns": ("longer sequences are refused",),
+    "max_stack_bytes": ("larger stacks are refused",),
+}
+
 
 class SynchronizerNode(RigNode):
     """Feeds `StackMatcher` with what arrives, publishes what it decides."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("synchronizer", **options)
-        self._matcher = StackMatcher(self._declare_settings())
+        self._matcher = StackMatcher(self.declare_fields(MatcherSettings(), _PARAMETERS))
         self.latch_settings(topics.MATCHING)(self._matcher.settings.to_dict())
         self._last_verdict = "none yet"
         self._frames = self.advertise(topics.FRAME)
@@ -36,29 +51,6 @@ class SynchronizerNode(RigNode):
         self.listen(topics.POSE, self._on_pose)
         self._ticks = self.create_timer(TICK_S, self._on_tick, clock=self.steady)
         self._ticks.cancel()
-
-    def _declare_settings(self) -> MatcherSettings:
-        default = MatcherSettings()
-        texts = {
-            "tolerance_fraction": "image and trigger stamps may differ by this part of a period",
-            "jitter_fraction": "scatter of these differences in a scan, part of a period",
-            "clock_offset_s": "known constant camera stamp minus projector stamp, s",
-            "settle_s": "wait so long after the last image for a surplus one, s",
-            "timeout_s": "give a scan up when so long nothing came that was due, s",
-            "early_image_s": "keep an image so long whose trigger did not come yet, s",
-            "require_pose": "refuse scans without stage poses before and after them",
-            "pose_max_age_s": "the pose before the first exposure may be so old, s",
-            "position_tolerance_m": "the part stood still when its poses agree so well, m",
-            "rotation_tolerance_rad": "the part stood still when its poses agree so well, rad",
-            "max_patterns": "longer sequences are refused",
-            "max_stack_bytes": "larger stacks are refused",
-        }
-        return MatcherSettings(
-            **{
-                name: self.declare(name, getattr(default, name), text)
-                for name, text in texts.items()
-            }
-        )
 
     def health(self) -> Health:
         """Counts of every verdict so far."""

@@ -10,11 +10,11 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -34,7 +34,11 @@ from sl_common.errors import SlError
 from sl_common.messages import interface_class
 from sl_common.topics import Service, Topic
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 _ResultT = TypeVar("_ResultT")
+_SettingsT = TypeVar("_SettingsT", bound="DataclassInstance")
 
 #: A refusal is a warning on `/diagnostics` for so long: at least two messages.
 NOTED_S = 2.5
@@ -74,7 +78,15 @@ _LEVELS = {
 
 
 def device_health(connected: bool, reason: str) -> tuple[str, str]:
-    """Level and message of a node that drives one device."""
+    """Level and message of a node that drives one device.
+
+    Parameters
+    ----------
+    connected : bool
+        Whether the device is open.
+    reason : str
+        Why it is not.
+    """
     return ("ok", "ready") if connected else ("error", reason)
 
 
@@ -186,9 +198,18 @@ class RigNode(GraphNode):
         high: float | None = None,
         live: bool = False,
     ) -> Any:
-        """Declare a parameter with its description and range, and return its value.
+        """Declare a parameter, and return its value.
 
-        ``live`` parameters may be set while the node runs, the others only when it starts.
+        Parameters
+        ----------
+        name, description : str
+            What it is called, and what it means (with its unit).
+        default : object
+            Its value where none is given; tells its type.
+        low, high : float, optional
+            Its range.
+        live : bool
+            Whether it may be set while the node runs, not only when it starts.
         """
         descriptor = ParameterDescriptor(description=description, read_only=not live)
         if low is not None and high is not None:
@@ -199,6 +220,26 @@ class RigNode(GraphNode):
                 span = IntegerRange(from_value=int(low), to_value=int(high), step=1)
                 descriptor.integer_range = [span]
         return self.declare_parameter(name, default, descriptor).value
+
+    def declare_fields(
+        self, default: _SettingsT, about: Mapping[str, Sequence[Any]], prefix: str = ""
+    ) -> _SettingsT:
+        """Declare parameters for fields of a dataclass, and return it with their values.
+
+        Parameters
+        ----------
+        default : dataclass
+            With the defaults.
+        about : mapping
+            By field: its description, or description and range, as `declare` takes them.
+        prefix : str
+            Of the parameters' names.
+        """
+        values = {
+            name: self.declare(prefix + name, getattr(default, name), *texts)
+            for name, texts in about.items()
+        }
+        return replace(default, **values)
 
     def listen(self, topic: Topic, handle: Callable[[Any], None]) -> Any:
         """Subscribe so that no message can end the node, and lost ones are counted.
@@ -247,6 +288,41 @@ class RigNode(GraphNode):
         kind = interface_class(service.kind)
         return self.create_service(kind, service.name, handle, callback_group=self.long_work)
 
+    def serve_work(
+        self,
+        service: Service,
+        work: Callable[[Any, Any], None],
+        failed: Callable[[SlError], None] = lambda _: None,
+    ) -> None:
+        """Offer a service whose work blocks; what goes wrong becomes its answer.
+
+        Parameters
+        ----------
+        service : Service
+            What; its response has the fields ``success`` and ``message``.
+        work : callable
+            Gets request and response in a worker's thread and fills the response, or raises.
+        failed : callable
+            Called with what was raised, there too.
+        """
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                work(request, response)
+            except Exception as error:  # the caller gets an answer whatever happens
+                known = isinstance(error, SlError)
+                response.success = False
+                response.message = str(error) if known else f"internal fault: {error!r}"
+                self.get_logger().error(f"{service.name} failed: {response.message}")
+                if isinstance(error, SlError):
+                    failed(error)
+            return response
+
+        async def handle(request: Any, response: Any) -> Any:
+            return await self.in_worker(partial(answer, request, response))
+
+        self.serve(service, handle)
+
     def serve_task(self, service: Service, action: Service, task: Task) -> ActionServer:
         """Offer long work as a service and as an action of the same meaning.
 
@@ -285,10 +361,8 @@ class RigNode(GraphNode):
             return task.fill(kind.Result(), outcome)
 
         self.serve(service, serve)
-        return ActionServer(
-            self, kind, action.name, execute,
-            callback_group=self.long_work, cancel_callback=lambda _: CancelResponse.ACCEPT,
-        )  # fmt: skip
+        how = {"callback_group": self.long_work, "cancel_callback": lambda _: CancelResponse.ACCEPT}
+        return ActionServer(self, kind, action.name, execute, **how)
 
     def shutting_down(self) -> bool:
         """Whether the node is about to end: long work is given up then."""
@@ -304,7 +378,15 @@ class RigNode(GraphNode):
         self.last_error, self._noted_s = text, time.monotonic()
 
     def complain(self, topic: str, error: Exception) -> None:
-        """Count and log something that was refused."""
+        """Count and log something that was refused.
+
+        Parameters
+        ----------
+        topic : str
+            On which it came.
+        error : Exception
+            Why it was refused.
+        """
         self.counts[f"{topic} refused"] += 1
         self.note(f"{topic}: {error}")
         self.get_logger().warning(self.last_error, throttle_duration_sec=0.2)
@@ -356,6 +438,13 @@ def run(make: Callable[[], RigNode], args: list[str] | None = None) -> None:
     """Make a node and spin it until SIGINT or SIGTERM; the exit status is then 0.
 
     A configuration that cannot work is one line and exit status 1.
+
+    Parameters
+    ----------
+    make : callable
+        Makes the node when ROS is up.
+    args : list of str, optional
+        Of ROS; by default those of the process.
     """
     node: RigNode | None = None
     try:

@@ -44,6 +44,15 @@ def find_in_directory(name: str, directory: str, dmd_size: tuple[int, int]) -> P
 
     Anyone in the ROS domain can call the service, so a name never leads out of the directory.
 
+    Parameters
+    ----------
+    name : str
+        Of the sequence, or of its file with or without ``.yaml``.
+    directory : str
+        Where files lie; empty: built-in sequences only.
+    dmd_size : tuple of int
+        (columns, rows) of a built-in sequence, DMD pixels.
+
     Raises
     ------
     SequenceError
@@ -93,8 +102,8 @@ class ProjectorNode(RigNode):
         self._triggers = self.advertise(topics.TRIGGER)
         self._camera_info = self.advertise(topics.PROJECTOR_INFO)
         self.listen(topics.CALIBRATION, self._on_calibration)
-        self.serve(topics.PROJECT, self._project)
-        self.serve(topics.STOP_PROJECTOR, self._halt)
+        self.serve_work(topics.PROJECT, self._project)
+        self.serve_work(topics.STOP_PROJECTOR, self._halt)
         self._link = DeviceLink("projector", self._connect, self.say)
         self._link.start()
         self._poller = threading.Thread(target=self._poll, name="projector status", daemon=True)
@@ -205,32 +214,20 @@ class ProjectorNode(RigNode):
         """Publish the projector of the calibration in force, as an inverse camera."""
         self._camera_info.publish(message.projector)
 
-    async def _project(self, request: Any, response: Any) -> Any:
+    def _project(self, request: Any, response: Any) -> None:
         if not self._busy.acquire(blocking=False):
-            response.message = f"the projector is busy: it shows {self._showing}"
-            return response
+            raise DeviceRefused(f"the projector is busy: it shows {self._showing}")
         try:
-            await self.in_worker(lambda: self._show(request, response))
-        except SlError as error:
-            response.success, response.message = False, str(error)
-            self.get_logger().error(f"projection failed: {error}")
-        except Exception as error:  # the caller gets an answer whatever happens
-            response.success, response.message = False, f"internal fault: {error!r}"
-            self.get_logger().error(f"projection failed: {error!r}")
+            self._show(request, response)
         finally:
             self._showing = ""
             self._busy.release()
-        return response
 
-    async def _halt(self, _request: Any, response: Any) -> Any:
+    def _halt(self, _request: Any, response: Any) -> None:
         """End a projection; whoever asked for it gets an error."""
         self._halted.set()
-        try:
-            await self.in_worker(lambda: self._link.device().stop())
-            response.success, response.message = True, "stopped"
-        except SlError as error:
-            response.message = str(error)
-        return response
+        self._link.device().stop()
+        response.success, response.message = True, "stopped"
 
     def _show(self, request: Any, response: Any) -> None:
         """Load, start, announce each pattern as it is exposed, wait for the end."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sl_common import topics
 from sl_common.base_node import RigNode
-from sl_common.errors import SlError, StackError
+from sl_common.errors import StackError
 from sl_reconstruct.cloud.cloud_reader import read_cloud
 from sl_reconstruct.measure.request import Answer, MeasurementRequest, carry_out
 
@@ -32,29 +32,27 @@ class MeasureService:
     def __init__(self, node: RigNode) -> None:
         self._node = node
         self._last: _Source | None = None
-        node.serve(topics.MEASURE, self._serve)
+        node.serve_work(topics.MEASURE, self._answer)
 
     def remember(self, points: NDArray[Any], stamp_ns: int) -> None:
-        """Take a cloud that was just published; it must not be written to any more."""
+        """Take a cloud that was just published.
+
+        Parameters
+        ----------
+        points : ndarray, (rows, columns), structured float32
+            The cloud; it must not be written to any more.
+        stamp_ns : int
+            Start of its scan's first exposure.
+        """
         self._last = _Source(f"scan {stamp_ns // 10**9}.{stamp_ns % 10**9:09d}", points)
 
-    async def _serve(self, request: Any, response: Any) -> Any:
-        return await self._node.in_worker(lambda: self._answer(request, response))
-
-    def _answer(self, request: Any, response: Any) -> Any:
-        """Fill the response whatever happens; runs in a worker."""
+    def _answer(self, request: Any, response: Any) -> None:
+        """Fill the response; what is not known stays NaN."""
         response.kind = request.kind
         response.value = response.uncertainty = math.nan
-        try:
-            source = self._source(request.cloud_file)
-            response.cloud = source.name
-            _fill(response, carry_out(_order(request), source.points))
-        except SlError as error:
-            response.success, response.message = False, str(error)
-        except Exception as error:  # the caller gets an answer whatever happens
-            response.success, response.message = False, f"internal fault: {error!r}"
-            self._node.get_logger().error(f"measure {request.kind}: {error!r}")
-        return response
+        source = self._source(request.cloud_file)
+        response.cloud = source.name
+        _fill(response, carry_out(_order(request), source.points))
 
     def _source(self, file: str) -> _Source:
         if file:

@@ -55,6 +55,11 @@ NO_CALIBRATION = "no calibration is in force: run 'slrig calibrate' or name a fi
 #: minutes, in which everybody waits for something else.
 REST_AFTER_S = 180.0
 
+_TIMEOUTS = {
+    "project_timeout_s": ("wait for the projector, s", 1.0, 3600.0),
+    "silence_timeout_s": ("wait for the next frame, the verdict, the stack, s", 0.1, 600.0),
+    "reconstruct_timeout_s": ("wait for the cloud, s", 1.0, 3600.0),
+}
 _SETTINGS = {
     "estimator": "matched, or cubic: the paper's third-order fit with secant and centres by BR8",
     "edge_blur_px": "standard deviation of an edge's blur, camera px; 0: measured in each stack",
@@ -101,19 +106,7 @@ class ReconstructNode(RigNode):
 
     def _declare_parameters(self) -> None:
         self.declare("max_repeats", 2, "how often a spoilt scan is repeated", 0, 254, live=True)
-        default = ScanTimeouts()
-        self._timeouts = ScanTimeouts(
-            project_s=self.declare(
-                "project_timeout_s", default.project_s, "wait for the projector, s", 1.0, 3600.0
-            ),
-            silence_s=self.declare(
-                "silence_timeout_s", default.silence_s,
-                "wait for the next frame, the verdict, the stack, s", 0.1, 600.0,
-            ),
-            reconstruct_s=self.declare(
-                "reconstruct_timeout_s", default.reconstruct_s, "wait for the cloud, s", 1.0, 3600.0
-            ),
-        )  # fmt: skip
+        self._timeouts = self.declare_fields(ScanTimeouts(), _TIMEOUTS)
 
     def _declare_settings(self) -> Settings:
         """Settings from parameters; 0 stands for those that are measured or derived."""

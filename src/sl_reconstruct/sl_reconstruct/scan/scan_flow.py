@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from sl_common.errors import SlError, StackError
 
@@ -100,35 +99,52 @@ class ScanWatch:
         self._condition = threading.Condition()
 
     def matched(self, index: int, count: int) -> None:
-        """One frame found its place."""
-        with self._told():
-            self.frames, self.count = max(self.frames, index + 1), count
-            self.last_image_ns = time.time_ns()
+        """One frame found its place.
+
+        Parameters
+        ----------
+        index, count : int
+            Position in the sequence, and its length.
+        """
+        self._tell(frames=max(self.frames, index + 1), count=count, last_image_ns=time.time_ns())
 
     def decided(self, complete: bool, reason: str) -> None:
-        """The synchroniser gave its verdict."""
-        with self._told():
-            self.verdict, self.reason = ("complete" if complete else "refused"), reason
+        """The synchroniser gave its verdict.
+
+        Parameters
+        ----------
+        complete : bool
+            Whether there is a stack.
+        reason : str
+            Why there is none.
+        """
+        self._tell(verdict="complete" if complete else "refused", reason=reason)
 
     def answered(self, success: bool, shown: int, message: str) -> None:
-        """The projector is done with so many patterns, or cannot."""
-        with self._told():
-            self.projected = (success, shown, message)
+        """The projector is done.
+
+        Parameters
+        ----------
+        success : bool
+            Whether it showed all patterns.
+        shown : int
+            How many it showed.
+        message : str
+            What it says.
+        """
+        self._tell(projected=(success, shown, message))
 
     def arrived(self) -> None:
         """The stack is here and will be worked on."""
-        with self._told():
-            self.stack_came = True
+        self._tell(stack_came=True)
 
     def finished(self, result: Any) -> None:
         """The stack became a report, or an error."""
-        with self._told():
-            self.result = result
+        self._tell(result=result)
 
     def sign(self) -> None:
         """Anything else that shows that work goes on."""
-        with self._told():
-            pass
+        self._tell()
 
     def silent_s(self) -> float:
         """Seconds since anything was told."""
@@ -139,24 +155,30 @@ class ScanWatch:
         with self._condition:
             self._condition.wait_for(done, POLL_S)
 
-    @contextmanager
-    def _told(self) -> Iterator[None]:
-        """Hold the lock while the watch is written, then wake who waits."""
+    def _tell(self, **values: Any) -> None:
+        """Set attributes, and wake who waits for them."""
         with self._condition:
-            yield
+            vars(self).update(values)
             self._sign_s = time.monotonic()
             self._condition.notify_all()
 
 
 class ScanDevices(Protocol):
-    """What a scan needs of the node."""
+    """What a scan needs of the graph."""
 
     def begin(self) -> ScanWatch:
         """Take a new scan number; from now on its watch is told what arrives."""
         ...
 
-    def project(self, watch: ScanWatch, order: ScanRequest) -> None:
+    def project(self, watch: ScanWatch, request: ScanRequest) -> None:
         """Ask the projector and return; the watch is told its answer.
+
+        Parameters
+        ----------
+        watch : ScanWatch
+            Of this attempt.
+        request : ScanRequest
+            Sequence and exposure.
 
         Raises
         ------
@@ -176,21 +198,57 @@ class ScanDevices(Protocol):
 
 @dataclass(frozen=True)
 class ScanTimeouts:
-    """How long is waited for something that should come, seconds.
+    """How long to wait for something that should come, seconds.
 
     Parameters
     ----------
-    project_s : float
+    project_timeout_s : float
         For the projector's answer, the upload of patterns included.
-    silence_s : float
+    silence_timeout_s : float
         For the next frame, the verdict, the stack.
-    reconstruct_s : float
+    reconstruct_timeout_s : float
         For the cloud once the stack is there; the first one may wait for the compiler.
     """
 
-    project_s: float = 120.0
-    silence_s: float = 5.0
-    reconstruct_s: float = 300.0
+    project_timeout_s: float = 120.0
+    silence_timeout_s: float = 5.0
+    reconstruct_timeout_s: float = 300.0
+
+
+class _Step(NamedTuple):
+    """Something that is waited for: its stage in the progress, and what to say if it fails."""
+
+    stage: str
+    is_done: Callable[[ScanWatch], bool]
+    timeout: str
+    lack: str
+
+
+_PROJECTION = _Step(
+    "project",
+    lambda watch: watch.projected is not None,
+    "project_timeout_s",
+    "the projector did not answer: is the projector node running?",
+)
+_VERDICT = _Step(
+    "match",
+    lambda watch: watch.verdict is not None,
+    "silence_timeout_s",
+    "no verdict came from the synchronizer: is the synchronizer node running?",
+)
+_STACK = _Step(
+    "match",
+    lambda watch: watch.stack_came,
+    "silence_timeout_s",
+    "the stack did not arrive though the synchronizer sent it: is the shared-memory profile in "
+    "force?",
+)
+_RESULT = _Step(
+    "reconstruct",
+    lambda watch: watch.result is not None,
+    "reconstruct_timeout_s",
+    "the reconstruction did not end in time",
+)
 
 
 class ScanRun:
@@ -198,9 +256,9 @@ class ScanRun:
 
     Parameters
     ----------
-    gear : ScanDevices
-        The node.
-    order : ScanRequest
+    devices : ScanDevices
+        The graph.
+    request : ScanRequest
         What is asked for.
     tell : callable
         Called with each change of progress.
@@ -212,13 +270,13 @@ class ScanRun:
 
     def __init__(
         self,
-        gear: ScanDevices,
-        order: ScanRequest,
+        devices: ScanDevices,
+        request: ScanRequest,
         tell: Callable[[ScanProgress], None],
         cancelled: Callable[[], bool],
         timeouts: ScanTimeouts,
     ) -> None:
-        self._gear, self._order, self._tell = gear, order, tell
+        self._devices, self._request, self._tell = devices, request, tell
         self._cancelled, self._timeouts = cancelled, timeouts
         self._told: ScanProgress | None = None
         self._attempt = 0
@@ -231,7 +289,7 @@ class ScanRun:
             result.report = self._repeat()
             result.success, result.message = True, "cloud published"
         except ScanCancelled as error:
-            self._gear.stop_projecting()
+            self._devices.stop_projecting()
             result.cancelled, result.message = True, str(error)
         except SlError as error:
             result.message = str(error)
@@ -243,11 +301,11 @@ class ScanRun:
             try:
                 return self._once()
             except ScanSpoilt as error:
-                if self._attempt > self._order.max_repeats:
+                if self._attempt > self._request.max_repeats:
                     made = "once" if self._attempt == 1 else f"{self._attempt} times"
                     raise ScanFailed(f"the scan was tried {made}, at last: {error}") from error
                 self._result.attempt_messages.append(str(error))
-                self._rest(self._attempt * self._order.rest_s)
+                self._rest(self._attempt * self._request.rest_s)
 
     def _rest(self, seconds: float) -> None:
         end_s = time.monotonic() + seconds
@@ -258,66 +316,52 @@ class ScanRun:
 
     def _once(self) -> Any:
         """One attempt: the node's report, or the reason why there is none."""
-        if gap := self._gear.missing(self._timeouts.silence_s):
+        if gap := self._devices.missing(self._timeouts.silence_timeout_s):
             raise ScanFailed(gap)
-        watch = self._gear.begin()
+        watch = self._devices.begin()
         self._result.scan_id = watch.scan_id
         self._report("project", watch)
-        self._gear.project(watch, self._order)
+        self._devices.project(watch, self._request)
         self._await_projection(watch)
         self._await_verdict(watch)
         return self._await_cloud(watch)
 
     def _await_projection(self, watch: ScanWatch) -> None:
-        self._wait(
-            watch, "project", lambda: watch.projected is not None, self._timeouts.project_s,
-            "the projector did not answer: is the projector node running?",
-        )  # fmt: skip
+        self._await(watch, _PROJECTION)
         success, shown, message = watch.projected or (False, 0, "")
         if not success and shown:
-            raise ScanSpoilt(f"the projector faltered in scan {watch.scan_id}: {message}")
+            raise ScanSpoilt(f"the projector failed during scan {watch.scan_id}: {message}")
         if not success:
             raise ScanFailed(f"the projector did not show the sequence: {message}")
 
     def _await_verdict(self, watch: ScanWatch) -> None:
-        self._wait(
-            watch, "match", lambda: watch.verdict is not None, self._timeouts.silence_s,
-            "no verdict came from the synchronizer: is the synchronizer node running?",
-        )  # fmt: skip
+        self._await(watch, _VERDICT)
         if watch.verdict == "refused":
             hint = "" if watch.frames else "; no image came: is the camera running and triggered?"
             raise ScanSpoilt(f"scan {watch.scan_id} refused: {watch.reason}{hint}")
 
     def _await_cloud(self, watch: ScanWatch) -> Any:
-        self._wait(
-            watch, "match", lambda: watch.stack_came, self._timeouts.silence_s,
-            "the stack did not arrive though the synchronizer sent it: is the shared-memory "
-            "profile in force?",
-        )  # fmt: skip
-        self._wait(
-            watch, "reconstruct", lambda: watch.result is not None, self._timeouts.reconstruct_s,
-            "the reconstruction did not end in time",
-        )  # fmt: skip
-        if isinstance(watch.result, StackError):
-            raise ScanSpoilt(f"scan {watch.scan_id}: {watch.result}") from watch.result
+        self._await(watch, _STACK)
+        self._await(watch, _RESULT)
         if isinstance(watch.result, Exception):
-            raise ScanFailed(f"scan {watch.scan_id}: {watch.result}") from watch.result
+            kind = ScanSpoilt if isinstance(watch.result, StackError) else ScanFailed
+            raise kind(f"scan {watch.scan_id}: {watch.result}") from watch.result
         self._report("publish", watch)
         return watch.result
 
-    def _wait(
-        self, watch: ScanWatch, stage: str, done: Callable[[], bool], timeout_s: float, lack: str
-    ) -> None:
-        """Wait until done; what else happens is told, and silence ends the scan."""
+    def _await(self, watch: ScanWatch, step: _Step) -> None:
+        """Wait for a step; what else happens is told, and silence ends the scan."""
+        timeout_s: float = getattr(self._timeouts, step.timeout)
         watch.sign()
-        while not done():
+        while not step.is_done(watch):
             if self._cancelled():
                 raise ScanCancelled(f"scan {watch.scan_id} cancelled")
             if watch.silent_s() > timeout_s:
-                raise ScanFailed(f"{self._gear.missing(0.0) or lack} (waited {timeout_s:g} s)")
-            self._report(stage, watch)
-            watch.wait(done)
-        self._report(stage, watch)
+                lack = self._devices.missing(0.0) or step.lack
+                raise ScanFailed(f"{lack} (waited {timeout_s:g} s)")
+            self._report(step.stage, watch)
+            watch.wait(lambda: step.is_done(watch))
+        self._report(step.stage, watch)
 
     def _report(self, stage: str, watch: ScanWatch) -> None:
         progress = ScanProgress(stage, self._attempt, watch.frames, watch.count)
