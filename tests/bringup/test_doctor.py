@@ -61,7 +61,7 @@ def test_shared_memory(monkeypatch: pytest.MonkeyPatch, free: int, level: str) -
 
 def test_a_missing_library_is_named_as_pip_knows_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(doctor_checks.LIBRARIES, "no_such_module", "no-such-library")
-    (finding,) = doctor_checks.libraries()
+    (finding,) = doctor_checks.collected("libraries", doctor_checks.libraries)
     assert finding.level == "bad"
     assert "no-such-library" in finding.remedy
 
@@ -83,8 +83,11 @@ def test_a_check_that_fails_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> Non
         ("firewire:1", "expected aravis:SERIAL"),
     ],
 )
-def test_cameras_that_are_not_there(address: str, text: str) -> None:
-    finding = doctor_devices.camera({"address": address}, running=False)[0]
+def test_cameras_that_are_not_there(tmp_path: Path, address: str, text: str) -> None:
+    config = tmp_path / "rig.yaml"
+    config.write_text(f"/sl/camera: {{ros__parameters: {{address: '{address}'}}}}\n")
+    found = doctor_devices.devices(config, running=False)
+    (finding,) = (f for f in found if f.subject == "camera")
     assert finding.level == "bad"
     assert text in finding.text
     assert finding.remedy

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from sl_bringup.cli.up import add_graph_arguments, graph_options
@@ -17,12 +17,16 @@ _MARKS = {"ok": "ok  ", "note": "note", "bad": "BAD "}
 
 def examine(options: GraphOptions) -> list[Finding]:
     """Check everything; a check that fails by itself is a finding too."""
-    steps: list[Callable[[], list[Finding]]] = [
-        checks.python, checks.libraries, checks.ros, checks.shared_memory,
-        lambda: checks.configuration(options), lambda: _devices(options),
-        lambda: checks.graph(options),
-    ]  # fmt: skip
-    return [finding for step in steps for finding in _guarded(step)]
+    steps: dict[str, Callable[[], Iterable[Finding]]] = {
+        "python": checks.python,
+        "libraries": checks.libraries,
+        "ROS": checks.ros,
+        "shared memory": checks.shared_memory,
+        "configuration": lambda: checks.configuration(options),
+        "devices": lambda: _devices(options),
+        "graph": lambda: checks.graph(options),
+    }
+    return [f for subject, step in steps.items() for f in checks.collected(subject, step)]
 
 
 def _devices(options: GraphOptions) -> list[Finding]:
@@ -32,13 +36,6 @@ def _devices(options: GraphOptions) -> list[Finding]:
     from sl_bringup.graph.doctor_devices import devices
 
     return devices(options.source, is_running(options.directory))
-
-
-def _guarded(step: Callable[[], list[Finding]]) -> list[Finding]:
-    try:
-        return step()
-    except Exception as error:  # the doctor reports, whatever it meets
-        return [Finding("bad", "check", f"could not be made: {error!r}", "report this")]
 
 
 def add_parser(subparsers: Any) -> None:

@@ -7,10 +7,11 @@ import importlib.util
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import yaml
 
@@ -23,16 +24,22 @@ from sl_bringup.graph.transport import (
     SMALL_SEGMENT_BYTES,
     free_bytes,
 )
-from sl_common.errors import DeviceError, SlError
+from sl_common.errors import SlError
 
 PYTHON_RANGE = ((3, 11), (3, 13))
 #: Module and the name under which pip knows it.
 LIBRARIES = {
-    "numpy": "numpy", "scipy": "scipy", "numba": "numba", "cv2": "opencv-python-headless",
-    "yaml": "PyYAML", "usb.core": "pyusb", "serial": "pyserial", "rosbags": "rosbags",
-    "matplotlib": "matplotlib", "plyfile": "plyfile",
-}  # fmt: skip
+    **{name: name for name in ("numpy", "scipy", "numba", "rosbags", "mcap", "matplotlib")},
+    **{"cv2": "opencv-python-headless", "yaml": "PyYAML", "plyfile": "plyfile"},
+    **{"usb.core": "pyusb", "serial": "pyserial"},
+}
 INSTALL = "make venv"
+#: What is found when it can be imported, and what mends it when not.
+ROS_MODULES = {
+    "rclpy": ("rclpy", INSTALL + "   (or source a ROS 2 Jazzy workspace)"),
+    "middleware": ("rmw_dds_common", INSTALL),
+    "sl_interfaces": ("sl_interfaces.action", "pip install src/sl_interfaces   (or colcon build)"),
+}
 
 
 @dataclass(frozen=True)
@@ -55,23 +62,57 @@ class Finding:
     remedy: str = ""
 
 
-def python() -> list[Finding]:
+class Trouble(Exception):
+    """What stops a check, and what mends it: the check's last finding, and a bad one."""
+
+    def __init__(self, text: str, remedy: str) -> None:
+        super().__init__(text)
+        self.remedy = remedy
+
+
+def collected(subject: str, check: Callable[[], Iterable[Finding]]) -> list[Finding]:
+    """Carry out a check, whatever it meets.
+
+    Parameters
+    ----------
+    subject : str
+        What it looks at.
+    check : callable
+        Gives its findings one after the other, and may raise `Trouble`.
+
+    Returns
+    -------
+    list of Finding
+        A check that fails by itself is a finding too.
+    """
+    found = []
+    try:
+        for finding in check():
+            found.append(finding)  # noqa: PERF402  # those before a trouble count
+    except Trouble as trouble:
+        found.append(Finding("bad", subject, str(trouble), trouble.remedy))
+    except Exception as error:
+        found.append(Finding("bad", subject, f"cannot be checked: {error!r}", "report this"))
+    return found
+
+
+def python() -> Iterator[Finding]:
     """Interpreter and environment."""
     version = ".".join(map(str, sys.version_info[:3]))
     low, high = PYTHON_RANGE
     if not low <= sys.version_info[:2] <= high:
         remedy = "install Python 3.12 and make the environment anew: make distclean venv"
-        return [Finding("bad", "python", f"{version}; the wheels of ROS are for 3.11-3.13", remedy)]
-    return [Finding("ok", "python", f"{version} in {sys.prefix}")]
+        raise Trouble(f"{version}; the wheels of ROS are for 3.11-3.13", remedy)
+    yield Finding("ok", "python", f"{version} in {sys.prefix}")
 
 
-def libraries() -> list[Finding]:
+def libraries() -> Iterator[Finding]:
     """Libraries that the commands need."""
     missing = [name for module, name in LIBRARIES.items() if not _there(module)]
     if missing:
         remedy = f"{sys.executable} -m pip install {' '.join(missing)}   (or: {INSTALL})"
-        return [Finding("bad", "libraries", f"missing: {', '.join(missing)}", remedy)]
-    return [Finding("ok", "libraries", f"all {len(LIBRARIES)} are there")]
+        raise Trouble(f"missing: {', '.join(missing)}", remedy)
+    yield Finding("ok", "libraries", f"all {len(LIBRARIES)} are there")
 
 
 def _there(module: str) -> bool:
@@ -81,25 +122,19 @@ def _there(module: str) -> bool:
         return False
 
 
-def ros() -> list[Finding]:
+def ros() -> Iterator[Finding]:
     """Middleware, client library and our messages."""
-    found = []
-    for subject, module, remedy in (
-        ("rclpy", "rclpy", INSTALL + "   (or source a ROS 2 Jazzy workspace)"),
-        ("middleware", "rmw_dds_common", INSTALL),
-        (
-            "sl_interfaces",
-            "sl_interfaces.action",
-            "pip install src/sl_interfaces   (or colcon build)",
-        ),
-    ):
+    for subject, (module, remedy) in ROS_MODULES.items():
         try:
             importlib.import_module(module)
         except ImportError as error:
-            found.append(Finding("bad", subject, f"cannot be imported: {error}", remedy))
+            yield Finding("bad", subject, f"cannot be imported: {error}", remedy)
         else:
-            found.append(Finding("ok", subject, _version(subject)))
-    return found + _rmw()
+            yield Finding("ok", subject, _version(subject))
+    chosen = os.environ.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
+    if chosen != "rmw_fastrtps_cpp":
+        text = f"RMW_IMPLEMENTATION={chosen}: tools started from here would not see the graph"
+        yield Finding("note", "middleware", text, "unset RMW_IMPLEMENTATION")
 
 
 def _version(subject: str) -> str:
@@ -110,43 +145,35 @@ def _version(subject: str) -> str:
         return "found"
 
 
-def _rmw() -> list[Finding]:
-    chosen = os.environ.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
-    if chosen != "rmw_fastrtps_cpp":
-        text = f"RMW_IMPLEMENTATION={chosen}: tools started from here would not see the graph"
-        return [Finding("note", "middleware", text, "unset RMW_IMPLEMENTATION")]
-    return []
-
-
-def shared_memory() -> list[Finding]:
+def shared_memory() -> Iterator[Finding]:
     """Room for the segments of large messages."""
     free = free_bytes()
     wanted = 2 * (sum(SEGMENT_BYTES.values()) + 4 * SMALL_SEGMENT_BYTES)
     text = f"{free // MIB} MB free in {SHM_DIRECTORY}"
     if free >= wanted:
-        return [Finding("ok", "shared memory", text)]
+        yield Finding("ok", "shared memory", text)
+        return
     remedy = (
         f"container: --shm-size={wanted // MIB}m or --ipc=host; host: "
         f"mount -o remount,size={wanted // MIB}m {SHM_DIRECTORY}"
     )
     text += f"; {wanted // MIB} MB are needed for full speed, segments shrink until then"
-    return [Finding("note" if free >= 32 * MIB else "bad", "shared memory", text, remedy)]
+    yield Finding("note" if free >= 32 * MIB else "bad", "shared memory", text, remedy)
 
 
-def configuration(options: GraphOptions) -> list[Finding]:
+def configuration(options: GraphOptions) -> Iterator[Finding]:
     """Configuration file, and the calibration that it names."""
     try:
         # A directory of its own: the files of a running graph stay as they are.
         config = write_config(options.source, options.directory / "doctor", options.changes)
     except SlError as error:
-        return [Finding("bad", "configuration", str(error), "mend the file")]
-    found = [Finding("ok", "configuration", str(options.source))]
-    if options.bench:
-        return found
-    section = yaml.safe_load(config.read_text()).get(f"{options.changes.namespace}/calibration", {})
-    parameters = section.get("ros__parameters", {})
-    named = str(parameters.get("calibration_file") or _accepted(parameters.get("store_dir")))
-    return [*found, _calibration(named)]
+        raise Trouble(str(error), "mend the file") from None
+    yield Finding("ok", "configuration", str(options.source))
+    if not options.bench:
+        node = f"{options.changes.namespace}/calibration"
+        parameters = yaml.safe_load(config.read_text()).get(node, {}).get("ros__parameters", {})
+        named = parameters.get("calibration_file") or _accepted(parameters.get("store_dir"))
+        yield from collected("calibration", lambda: _calibration(str(named)))
 
 
 def _accepted(store_dir: str | None) -> str:
@@ -159,65 +186,38 @@ def _accepted(store_dir: str | None) -> str:
         return ""
 
 
-def _calibration(file: str) -> Finding:
+def _calibration(file: str) -> Iterator[Finding]:
     from sl_reconstruct.model.calibration_file import load_calibration
 
     if not file:
         remedy = "run 'slrig calibrate', or name one with --calibration FILE"
-        return Finding("bad", "calibration", "none is named; scans will be refused", remedy)
+        raise Trouble("none is named; scans will be refused", remedy)
     try:
         calibration = load_calibration(Path(file))
     except SlError as error:
-        return Finding("bad", "calibration", str(error), "name another file, or calibrate anew")
-    return Finding("ok", "calibration", f"{file} ({calibration.hash[:12]})")
+        raise Trouble(str(error), "name another file, or calibrate anew") from None
+    yield Finding("ok", "calibration", f"{file} ({calibration.hash[:12]})")
 
 
-def find_usb(vendor: int, product: int) -> list[Any]:
-    """Return the USB devices with these ids.
-
-    Parameters
-    ----------
-    vendor, product : int
-        USB ids.
-
-    Raises
-    ------
-    DeviceError
-        When libusb is missing.
-    """
-    import usb.core
-
-    try:
-        return list(usb.core.find(find_all=True, idVendor=vendor, idProduct=product))
-    except usb.core.NoBackendError as error:
-        raise DeviceError("libusb is not installed") from error
-
-
-def serial_ports() -> dict[str, str]:
-    """Serial ports of this machine and what they say of themselves."""
-    from serial.tools.list_ports import comports
-
-    return {port.device: port.description for port in comports()}
-
-
-def graph(options: GraphOptions) -> list[Finding]:
+def graph(options: GraphOptions) -> Iterator[Finding]:
     """A running graph and what its nodes say."""
     if not _there("rclpy"):
-        return []
+        return
     command = readiness_command(options, "--timeout", "4", "--states")
-    asked: Any = subprocess.run(
+    asked = subprocess.run(
         command, env=client_environment(options), capture_output=True, text=True, check=False
     )
-    states = [_state(line) for line in asked.stdout.splitlines() if " | " in line]
-    if asked.returncode == 0:
-        return [Finding("ok", "graph", f"running and ready in domain {options.domain}"), *states]
     complaint = asked.stderr.strip().removeprefix("graph not ready: ")
-    if all(f"{name} is silent" in complaint for name in options.nodes):
+    if asked.returncode == 0:
+        yield Finding("ok", "graph", f"running and ready in domain {options.domain}")
+    elif all(f"{name} is silent" in complaint for name in options.nodes):
         remedy = "slrig up" + (" --bench" if options.bench else "")
         remedy += f" --config {options.config}" if options.config else ""
-        return [Finding("note", "graph", f"none runs in domain {options.domain}", remedy)]
-    remedy = "see the nodes' log; slrig up restarts dead ones"
-    return [Finding("bad", "graph", complaint, remedy), *states]
+        yield Finding("note", "graph", f"none runs in domain {options.domain}", remedy)
+        return
+    else:
+        yield Finding("bad", "graph", complaint, "see the nodes' log; slrig up restarts dead ones")
+    yield from (_state(line) for line in asked.stdout.splitlines() if " | " in line)
 
 
 def _state(line: str) -> Finding:

@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import grp
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import usb.core
 import yaml
+from serial.tools.list_ports import comports
 
 import sl_projector
-from sl_bringup.graph.doctor_checks import Finding, find_usb, serial_ports
-from sl_bringup.graph.graph_config import NODES, started_nodes
+from sl_bringup.graph.doctor_checks import Finding, Trouble, collected
+from sl_bringup.graph.graph_config import started_nodes
 from sl_camera.drivers.aravis_library import INSTALL as ARAVIS_INSTALL
 from sl_camera.drivers.aravis_library import find_camera, list_cameras, load_aravis
 from sl_camera.drivers.camera_drivers import make_camera
@@ -44,20 +47,24 @@ RELOAD = (
 #: What is said of devices that the configuration has no section for.
 LEFT_OUT = {
     "camera": Finding(
-        "note", "camera", "no section /sl/camera: another driver is to publish camera/image_raw",
+        "note",
+        "camera",
+        "no section /sl/camera: another driver is to publish camera/image_raw",
         "remap that driver's images (docs/cameras.md)",
     ),
     "stage": Finding(
-        "note", "stage", "no section /sl/stage: a rig without a stage",
+        "note",
+        "stage",
+        "no section /sl/stage: a rig without a stage",
         "say require_pose: false in the section /sl/synchronizer",
     ),
-}  # fmt: skip
+}
 #: Longest wait for a stage's answer; grblHAL may need a second.
 STAGE_TIMEOUT_S = 2.0
 
 
 def devices(source: Path, running: bool) -> list[Finding]:
-    """Look at all devices that a configuration names; ``running``: its graph has them open.
+    """Look at all devices that a configuration names.
 
     Parameters
     ----------
@@ -67,17 +74,15 @@ def devices(source: Path, running: bool) -> list[Finding]:
         Its graph has the devices open.
     """
     sections = yaml.safe_load(source.read_text()) or {}
-
-    def of(node: str) -> dict[str, Any]:
-        return dict(sections.get(f"/sl/{node}", {}).get("ros__parameters", {}))
-
-    looks = ((projector, "projector"), (stage, "stage"), (camera, "camera"))
-    left_out = set(NODES) - set(started_nodes(source))
-    return [
-        finding
-        for look, node in looks
-        for finding in ([LEFT_OUT[node]] if node in left_out else look(of(node), running))
-    ]
+    started = started_nodes(source)
+    found: list[Finding] = []
+    for node, look in (("projector", _projector), ("stage", _stage), ("camera", _camera)):
+        parameters = sections.get(f"/sl/{node}", {}).get("ros__parameters", {})
+        if node in started:
+            found += collected(node, partial(look, parameters, running))
+        else:
+            found.append(LEFT_OUT[node])
+    return found
 
 
 # -- permissions and owners -----------------------------------------------------------------
@@ -128,91 +133,92 @@ def _name(pid: int) -> str:
     return " ".join(words[:3]).strip()
 
 
-def _busy(subject: str, text: str, node: Path | None) -> Finding:
+def _busy(text: str, node: Path | None) -> Trouble:
     holders = _holders(node) if node else ""
     if holders:
-        return Finding("bad", subject, f"{text}: {holders} has it", "stop that program")
-    remedy = f"sudo fuser -v {node}   shows who has it; stop that" if node else "stop who has it"
-    return Finding("bad", subject, text, remedy)
+        return Trouble(f"{text}: {holders} has it", "stop that program")
+    who = f"sudo fuser -v {node}   shows who has it; stop that" if node else "stop who has it"
+    return Trouble(text, who)
 
 
 # -- projector ------------------------------------------------------------------------------------
 
 
-def projector(parameters: dict[str, Any], running: bool) -> list[Finding]:
-    """The projector's controller: there, permitted, free, of the right kind, and well.
-
-    Parameters
-    ----------
-    parameters : dict
-        Section of the node.
-    running : bool
-        The graph has it open.
-    """
-    name, device = parameters.get("dmd_model", DEFAULT_MODEL), parameters.get("device", "usb")
+def _projector(parameters: Mapping[str, Any], running: bool) -> Iterator[Finding]:
+    """The projector's controller: there, permitted, free, of the right kind, and well."""
+    name, device = parameters.get("dmd_model", DEFAULT_MODEL), str(parameters.get("device", "usb"))
     if name not in MODELS:
         text = f"dmd_model {name!r} is unknown; there are {', '.join(sorted(MODELS))}"
-        return [Finding("bad", "projector", text, "correct dmd_model in the configuration")]
-    kind, _, place = str(device).partition(":")
-    if kind == "socket":
-        if not Path(place).exists():
-            remedy = "start what serves it (the bench: slrig up --bench), or say device: usb"
-            return [Finding("bad", "projector", f"nothing at {place}", remedy)]
-        return [_projector_state(str(device), str(name), running, None)]
-    return _usb_projector(str(device), str(name), running)
+        raise Trouble(text, "correct dmd_model in the configuration")
+    kind, _, place = device.partition(":")
+    if kind != "socket":
+        node = _usb_controller(name, place)
+        yield _projector_state(device, name, running, node)
+    elif Path(place).exists():
+        yield _projector_state(device, name, running, None)
+    else:
+        remedy = "start what serves it (the bench: slrig up --bench), or say device: usb"
+        raise Trouble(f"nothing at {place}", remedy)
 
 
-def _usb_projector(device: str, name: str, running: bool) -> list[Finding]:
+def _usb_controller(name: str, serial: str) -> Path:
+    """Device file of the controller that the configuration means, where it may be used."""
     chip = MODELS[name].controller
-    try:
-        there = {c: find_usb(VENDOR, product) for c, product in CONTROLLERS.items()}
-    except SlError as error:
-        return [Finding("bad", "projector", str(error), "sudo apt install libusb-1.0-0")]
-    if there[chip]:
-        return [_chosen(there[chip], device, name, running)]
-    others = [other for other, found in there.items() if found]
-    if others:
-        models = [m.name for m in MODELS.values() if m.controller == others[0]]
-        remedy = f"say dmd_model: {' or '.join(models)} in the configuration"
-        text = f"no {chip}, but a {others[0]} is on the USB"
-        return [Finding("bad", "projector", text, remedy)]
-    text = f"no {chip} ({VENDOR:04x}:{CONTROLLERS[chip]:04x}) on the USB; the configuration asks "
-    remedy = "plug it in and switch it on (lsusb must list it); without hardware: add --bench"
-    return [Finding("bad", "projector", text + f"for a {name}", remedy)]
-
-
-def _chosen(found: list[Any], device: str, name: str, running: bool) -> Finding:
-    """Of the controllers on the USB the one that the configuration means."""
-    chip, serial = MODELS[name].controller, device.partition(":")[2]
+    there = {c: _find_usb(product) for c, product in CONTROLLERS.items()}
+    if not there[chip]:
+        raise _no_controller(name, [other for other, found in there.items() if found])
+    found = there[chip]
     means = [one for one in found if not serial or serial_number(one) == serial]
     closed = [one for one in found if not _may_use(_usb_node(one))]
     if not means and not closed:
-        there = ", ".join(serial_number(one) or "none" for one in found)
-        text = f"no {chip} of serial number {serial!r}; on the USB: {there}"
-        remedy = "correct device in the configuration (usb: the first that is found)"
-        return Finding("bad", "projector", text, remedy)
+        others = ", ".join(serial_number(one) or "none" for one in found)
+        raise Trouble(
+            f"no {chip} of serial number {serial!r}; on the USB: {others}",
+            "correct device in the configuration (usb: the first that is found)",
+        )
     node = _usb_node((means or closed)[0])
     if not _may_use(node):
-        return _forbidden(chip, node)
-    return _projector_state(device, name, running, node)
+        raise _forbidden(chip, node)
+    return node
+
+
+def _find_usb(product: int) -> list[Any]:
+    try:
+        return list(usb.core.find(find_all=True, idVendor=VENDOR, idProduct=product))
+    except usb.core.NoBackendError:
+        raise Trouble("libusb is not installed", "sudo apt install libusb-1.0-0") from None
+
+
+def _no_controller(name: str, others: Sequence[str]) -> Trouble:
+    chip = MODELS[name].controller
+    if others:
+        models = [m.name for m in MODELS.values() if m.controller == others[0]]
+        return Trouble(
+            f"no {chip}, but a {others[0]} is on the USB",
+            f"say dmd_model: {' or '.join(models)} in the configuration",
+        )
+    return Trouble(
+        f"no {chip} ({VENDOR:04x}:{CONTROLLERS[chip]:04x}) on the USB; the configuration asks for "
+        f"a {name}",
+        "plug it in and switch it on (lsusb must list it); without hardware: add --bench",
+    )
 
 
 def _usb_node(device: Any) -> Path:
     return USB_NODES / f"{device.bus:03d}" / f"{device.address:03d}"
 
 
-def _forbidden(chip: str, node: Path) -> Finding:
+def _forbidden(chip: str, node: Path) -> Trouble:
     """No permission: the rule is missing, or there and not in force."""
     if not node.exists():
         text = f"{chip} is on the USB, but there is no {node}"
-        remedy = "in a container: start it with --device=/dev/bus/usb"
-        return Finding("bad", "projector", text, remedy)
+        return Trouble(text, "in a container: start it with --device=/dev/bus/usb")
     rule = _udev_rule(CONTROLLERS[chip])
     if rule is None:
         text = f"{chip} is there, but you have no permission for {node} and no udev rule gives it"
-        return Finding("bad", "projector", text, f"sudo cp {RULES} /etc/udev/rules.d/ && {RELOAD}")
+        return Trouble(text, f"sudo cp {RULES} /etc/udev/rules.d/ && {RELOAD}")
     text = f"{chip} is there, {rule} has a rule for it, but you have no permission for {node}"
-    return Finding("bad", "projector", text, f"{RELOAD}; or {_join_group(node)}")
+    return Trouble(text, f"{RELOAD}; or {_join_group(node)}")
 
 
 def _udev_rule(product: int) -> Path | None:
@@ -227,7 +233,7 @@ def _udev_rule(product: int) -> Path | None:
 
 
 def _projector_state(device: str, name: str, running: bool, node: Path | None) -> Finding:
-    chip, place = MODELS[name].controller, f" at {node}" if node else f" at {device}"
+    chip, place = MODELS[name].controller, f" at {node or device}"
     if running:
         return Finding("ok", "projector", f"{chip}{place}, the running graph has it")
     driver = Dlpc350(device) if chip == "DLPC350" else Dlpc900(device, dmd_model(name))
@@ -235,126 +241,112 @@ def _projector_state(device: str, name: str, running: bool, node: Path | None) -
         status = driver.look()
     except DeviceLost as error:
         if "another program" in str(error):
-            return _busy("projector", f"{chip}{place} is busy", node)
-        return Finding("bad", "projector", str(error), "unplug it and plug it in again")
+            raise _busy(f"{chip}{place} is busy", node) from None
+        raise Trouble(str(error), "unplug it and plug it in again") from None
     except DeviceTimeout as error:
-        remedy = "switch it off and on again"
-        return Finding("bad", "projector", f"{chip}{place} does not answer: {error}", remedy)
+        text = f"{chip}{place} does not answer: {error}"
+        raise Trouble(text, "switch it off and on again") from None
     except SlError as error:
-        return Finding("bad", "projector", str(error), "correct dmd_model, or see docs/dlpc350.md")
+        raise Trouble(str(error), "correct dmd_model, or see docs/dlpc350.md") from None
     text = f"{name} on a {chip}{place}, firmware {status.firmware}, {status.power}"
     if status.problems:
         remedy = "switch it off and on; if it says so again, check the DMD's cable and supply"
-        return Finding("bad", "projector", f"{text}: {'; '.join(status.problems)}", remedy)
+        raise Trouble(f"{text}: {'; '.join(status.problems)}", remedy)
     return Finding("ok", "projector", text + (", showing patterns" if status.running else ""))
 
 
 # -- stage ----------------------------------------------------------------------------------------
 
 
-def stage(parameters: dict[str, Any], running: bool) -> list[Finding]:
-    """The stage's port: there, permitted, free; and what answers on it.
-
-    Parameters
-    ----------
-    parameters : dict
-        Section of the node.
-    running : bool
-        The graph has it open.
-    """
+def _stage(parameters: Mapping[str, Any], running: bool) -> Iterator[Finding]:
+    """The stage's port: there, permitted, free; and what answers on it."""
     kind, port = parameters.get("kind", "grbl"), parameters.get("port", "")
     if kind == "manual":
-        return [Finding("ok", "stage", "moved by hand, confirmed by stage/confirm")]
-    found = [Finding("note", "serial ports", _ports() or "none on this machine")]
+        yield Finding("ok", "stage", "moved by hand, confirmed by stage/confirm")
+        return
+    yield Finding("note", "serial ports", _ports() or "none on this machine")
+    node = Path(port)
     if not port:
         remedy = "put port: into the configuration, or require_pose: false for a rig without stage"
-        return [*found, Finding("note", "stage", "the configuration names no port", remedy)]
-    node = Path(port)
-    if not node.exists():
+        yield Finding("note", "stage", "the configuration names no port", remedy)
+    elif not node.exists():
         remedy = "plug it in and switch it on, or name one of the ports above in the configuration"
-        return [*found, Finding("bad", "stage", f"no port {port}", remedy)]
-    if not _may_use(node):
-        text = f"you have no permission for {port}"
-        return [*found, Finding("bad", "stage", text, _join_group(node))]
-    return [*found, _stage_state(kind, node, parameters, running)]
+        raise Trouble(f"no port {port}", remedy)
+    elif not _may_use(node):
+        raise Trouble(f"you have no permission for {port}", _join_group(node))
+    elif running:
+        yield Finding("ok", "stage", f"{kind} at {node}, the running graph has it")
+    else:
+        yield _stage_state(kind, node, parameters)
 
 
 def _ports() -> str:
     """Serial ports with the names that stay when they are plugged in elsewhere."""
     names = {str(link.resolve()): link for link in SERIAL_NAMES.glob("*")}
-    ports = serial_ports().items()
-    return ", ".join(f"{port} ({names.get(port, description)})" for port, description in ports)
+    return ", ".join(f"{p.device} ({names.get(p.device, p.description)})" for p in comports())
 
 
-def _stage_state(kind: str, node: Path, parameters: dict[str, Any], running: bool) -> Finding:
-    if running:
-        return Finding("ok", "stage", f"{kind} at {node}, the running graph has it")
+def _stage_state(kind: str, node: Path, parameters: Mapping[str, Any]) -> Finding:
     if _holders(node.resolve()):
-        return _busy("stage", f"{node} is busy", node.resolve())
+        raise _busy(f"{node} is busy", node.resolve())
     driver = _stage_driver(kind, str(node), parameters)
     try:
         driver.open()
         state = driver.state()
     except DeviceTimeout as error:
+        text = f"{node} is there, but no {kind} stage: {error}"
         remedy = "is it switched on? is it this port (see above), this baud and this kind?"
-        return Finding("bad", "stage", f"{node} is there, but no {kind} stage: {error}", remedy)
+        raise Trouble(text, remedy) from None
     except DeviceLost as error:
-        return _busy("stage", str(error), node.resolve())
+        raise _busy(str(error), node.resolve()) from None
     except SlError as error:
-        return Finding("bad", "stage", str(error), "correct kind and port in the configuration")
+        raise Trouble(str(error), "correct kind and port in the configuration") from None
     finally:
         driver.close()
     text = f"{kind} at {node}, {state.kind}{f': {state.text}' if state.text else ''}"
     if state.kind == "alarm":
-        remedy = "take the cause away, then call the service stage/clear of the graph"
-        return Finding("bad", "stage", text, remedy)
+        raise Trouble(text, "remove the cause, then call the service stage/clear of the graph")
     if state.kind == "not_homed":
         remedy = "call the service stage/home of the graph, or say home_at_start: true"
         return Finding("note", "stage", text, remedy)
     return Finding("ok", "stage", text)
 
 
-def _stage_driver(kind: str, port: str, parameters: dict[str, Any]) -> StageDriver:
+def _stage_driver(kind: str, port: str, parameters: Mapping[str, Any]) -> StageDriver:
     baud = int(parameters.get("baud", 115200))
     if kind == "zaber":
-        where = (
-            parameters.get("zaber_devices", (1, 2, 3)),
-            parameters.get("zaber_axes", (1, 1, 1)),
-        )
-        return ZaberStage(port, zaber_axes(*where), baud=baud)
+        addresses = parameters.get("zaber_devices", (1, 2, 3))
+        axes = zaber_axes(addresses, parameters.get("zaber_axes", (1, 1, 1)))
+        return ZaberStage(port, axes, baud=baud)
     return GrblStage(port, baud=baud, reply_timeout_s=STAGE_TIMEOUT_S)
 
 
 # -- camera ---------------------------------------------------------------------------------------
 
 
-def camera(parameters: dict[str, Any], running: bool) -> list[Finding]:
-    """The camera that the configuration names, and those that answer.
-
-    Parameters
-    ----------
-    parameters : dict
-        Section of the node.
-    running : bool
-        The graph has it open.
-    """
+def _camera(parameters: Mapping[str, Any], running: bool) -> Iterator[Finding]:
+    """The camera that the configuration names, and those that answer."""
     address = str(parameters.get("address", ""))
+    kind, _, place = address.rpartition(":")
+    if kind != "aravis":
+        yield _aravis()
     if not address:
         remedy = "put its address into the configuration (docs/cameras.md)"
-        return [Finding("note", "camera", "no address in the configuration", remedy), _aravis()]
+        yield Finding("note", "camera", "no address in the configuration", remedy)
+        return
     try:
         make_camera(address)
     except SlError as error:
-        return [Finding("bad", "camera", str(error), "correct the configuration")]
-    kind, _, place = address.rpartition(":")
+        raise Trouble(str(error), "correct the configuration") from None
     if kind == "aravis":
-        return [_genicam(place)]
-    if kind == "uvc":
-        return [_video(place, running), _aravis()]
-    if not Path(place).exists():
+        yield _genicam(place)
+    elif kind == "uvc":
+        yield _video(place, running)
+    elif Path(place).exists():
+        yield Finding("ok", "camera", address)
+    else:
         remedy = "start the process that serves the camera, or correct the configuration"
-        return [Finding("bad", "camera", f"nothing at {place}", remedy), _aravis()]
-    return [Finding("ok", "camera", address), _aravis()]
+        raise Trouble(f"nothing at {place}", remedy)
 
 
 def _aravis() -> Finding:
@@ -374,11 +366,9 @@ def _genicam(name: str) -> Finding:
             "arv-tool-0.8 (package aravis-tools-cli) lists what answers; GigE: an address in the "
             "camera's network, UDP let in; USB3: 61-sl-camera.rules (docs/cameras.md)"
         )
-        return Finding("bad", "camera", str(error), remedy)
+        raise Trouble(str(error), remedy) from None
     except SlError as error:
-        return Finding(
-            "bad", "camera", str(error).removesuffix(f"; {ARAVIS_INSTALL}"), ARAVIS_INSTALL
-        )
+        raise Trouble(str(error).removesuffix(f"; {ARAVIS_INSTALL}"), ARAVIS_INSTALL) from None
     return Finding("ok", "camera", f"{found} (answering: {others or 'none'})")
 
 
@@ -387,10 +377,9 @@ def _video(device: str, running: bool) -> Finding:
     if not path.exists():
         there = ", ".join(map(str, sorted(Path("/dev").glob("video*")))) or "none"
         remedy = "plug it in, or name another (v4l2-ctl --list-devices)"
-        return Finding("bad", "camera", f"no {path}; there are: {there}", remedy)
+        raise Trouble(f"no {path}; there are: {there}", remedy)
     if not _may_use(path):
-        text = f"you have no permission for {path}"
-        return Finding("bad", "camera", text, _join_group(path))
+        raise Trouble(f"you have no permission for {path}", _join_group(path))
     if not running and _holders(path.resolve()):
-        return _busy("camera", f"{path} is busy", path.resolve())
+        raise _busy(f"{path} is busy", path.resolve())
     return Finding("ok", "camera", str(path))
