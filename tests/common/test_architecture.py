@@ -66,7 +66,7 @@ SDK_FILES = {
     "sl_camera/stage/grbl/grbl_stage.py", "sl_camera/stage/serial_lines.py",
     "sl_camera/drivers/aravis_library.py", "sl_bench/dlpc/usb_server.py",
     "sl_bench/stage/serial_emulator.py", "sl_bringup/cli/doctor.py",
-    "sl_bringup/graph/doctor_checks.py",
+    "sl_bringup/graph/doctor_devices.py",
 }  # fmt: skip
 ROS_MODULES = re.compile(
     r"^(rclpy|rcl_interfaces|sl_interfaces|builtin_interfaces|std_srvs|rosgraph_msgs|\w+_msgs)(\.|$)"

@@ -144,8 +144,8 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--namespace", default="/sl")
     parser.add_argument("--nodes", nargs="+", required=True)
-    parser.add_argument("--states", action="store_true", help="tell what each node said at last")
-    parser.add_argument("--timeout", type=float, default=0.0, help="seconds; 0: wait for ever")
+    parser.add_argument("--states", action="store_true", help="print each node's last word")
+    parser.add_argument("--timeout", type=float, default=0.0, help="seconds; 0: none")
     parser.add_argument(
         "--wait-for-compiler", action="store_true", help="no time-out while a node is compiling"
     )

@@ -88,7 +88,7 @@ class _Chunk:
 
 
 class _Section(ReadDataStream):
-    """A part of a file for the readers of `mcap`; they take less than asked for, this does not."""
+    """A part of a file for the decoders of `mcap`, which do not notice that bytes are missing."""
 
     def __init__(self, file: BinaryIO, start: int, length: int) -> None:
         super().__init__(file)
@@ -96,7 +96,7 @@ class _Section(ReadDataStream):
         file.seek(start)
 
     def read(self, length: int) -> bytes:
-        """Read exactly so many bytes; a damaged length is noticed before memory is taken."""
+        """Read exactly this many bytes; a damaged length is noticed before memory is taken."""
         left = self._length - self.count
         data = super().read(length) if length <= left else b""
         if len(data) < length:

@@ -1,7 +1,7 @@
-"""Reading sqlite3 files of recordings that are cut or damaged: message by message.
+"""Reading sqlite3 files of recordings that are cut or damaged, message by message.
 
-SQLite itself refuses a file that is shorter than it should be. Its tree of pages is whole as far as
-the file goes, so a message is found by its number when all pages on the way to it are there.
+SQLite itself refuses a file that is shorter than its header says. A message is found by its number
+when all pages on the way to it are in the file (``docs/decisions/0013``).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rosbags.rosbag2 import ReaderError
 
 from sl_bringup.bag.mcap_reader import offered_qos
 
-#: So many numbers without a readable message in a row are taken for the end.
+#: The end is assumed after this many numbers in a row without a readable message.
 PATIENCE = 20_000
 #: What SQLite and the decoding of its text do with damaged pages.
 _FAULTS = (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError)
@@ -102,7 +102,6 @@ class SalvagedFile:
     def _connection(
         self, number: int, name: str, kind: str, serialisation: str, qos: str, digest: str
     ) -> Connection:
-        return Connection(
-            number, name, kind, MessageDefinition(MessageDefinitionFormat.NONE, ""), digest, 0,
-            ConnectionExtRosbag2(serialisation, offered_qos({"offered_qos_profiles": qos})), self,
-        )  # fmt: skip
+        definition = MessageDefinition(MessageDefinitionFormat.NONE, "")
+        ext = ConnectionExtRosbag2(serialisation, offered_qos({"offered_qos_profiles": qos}))
+        return Connection(number, name, kind, definition, digest, 0, ext, self)

@@ -1,4 +1,4 @@
-"""``slrig doctor``: what is missing on this machine, and what mends it."""
+"""``slrig doctor``: what is missing on this machine, and the remedy."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def add_parser(subparsers: Any) -> None:
         help="say what is missing on this machine, and what to do",
         description="Check Python, libraries, ROS, shared memory, configuration, devices and the "
         "running graph. Devices are asked how they are and never moved; those of a running graph "
-        "are left to it, and it tells. (An Arduino at a serial port restarts when it is opened.) "
+        "are left alone: its nodes report. (An Arduino at a serial port restarts when opened.) "
         "With --bench nothing about hardware is asked for. The exit status is 0 when nothing that "
         "is needed is missing.",
         epilog="examples:\n  slrig doctor --bench\n  slrig doctor --config my_rig.yaml",
@@ -63,5 +63,5 @@ def run(args: argparse.Namespace) -> int:
         if finding.remedy:
             say(f"{'':<19} -> {finding.remedy}")
     bad = sum(finding.level == "bad" for finding in findings)
-    say(f"{bad} thing{'s' if bad != 1 else ''} to mend" if bad else "all is well")
+    say(f"{bad} thing{'s' if bad != 1 else ''} to fix" if bad else "all is well")
     return 1 if bad else 0

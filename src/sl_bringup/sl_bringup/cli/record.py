@@ -38,16 +38,16 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--split", default="0", metavar="SIZE", help="begin another file after so much: 500MB, 2GB"
     )
-    parser.add_argument(
-        "--compress", action="store_true",
-        help="images too (zstd): 10 %% smaller where all is lit, 40 %% where half is not, "
-        "for 7 ms of a core per 2 MB; small messages always are",
-    )  # fmt: skip
+    text = (
+        "images too (zstd): 10 %% smaller where all is lit, 40 %% where half is not, for 7 ms of a "
+        "core per 2 MB; small messages always are"
+    )
+    parser.add_argument("--compress", action="store_true", help=text)
     add_client_arguments(parser)
     parser.set_defaults(run=run)
 
 
-#: Of smaller files there would be one for every message or so.
+#: Smaller files would hold one message or two each.
 LEAST_SPLIT = 1_000_000
 
 

@@ -1,10 +1,10 @@
-"""``slrig repair``: what can be read of a damaged recording, as a whole one."""
+"""``slrig repair``: what can be read of a damaged recording, copied into a complete one."""
 
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,6 @@ from sl_bringup.graph.console import StatusLine, complain, say
 from sl_bringup.graph.version import software_version
 from sl_common.errors import BagError
 from sl_common.topics import Topic
-
-SHOW_S = 0.5
 
 
 def add_parser(subparsers: Any) -> None:
@@ -79,24 +77,17 @@ def repair(bag: Bag, output: Path) -> int:
             f"{bag.path} has no readable message: {'; '.join(bag.lost) or 'it is empty'}"
         )
     custom = {"software": software_version(), "repaired_from": bag.path.resolve().name}
-    status, shown_s, count = StatusLine("copying"), 0.0, 0
+    status, count = StatusLine("copying"), 0
     with BagRecorder(output, custom) as new:
-        for connection, received_ns, data in _known(bag, new, _chained(first, messages)):
+        for connection, received_ns, data in _known(bag, new, chain([first], messages)):
             new.write(connection.topic, received_ns, received_ns, bytes(data))
             new.tick()
             count += 1
-            if time.monotonic() >= shown_s:
-                shown_s = time.monotonic() + SHOW_S
-                status.show(f"{count} messages, {new.size / 1e6:.1f} MB")
+            status.show(f"{count} messages, {new.size / 1e6:.1f} MB")
     return count
 
 
 _Packet = tuple[Connection, int, bytes | memoryview]
-
-
-def _chained(first: _Packet, rest: Iterator[_Packet]) -> Iterator[_Packet]:
-    yield first
-    yield from rest
 
 
 def _known(bag: Bag, new: BagRecorder, messages: Iterator[_Packet]) -> Iterator[_Packet]:

@@ -18,7 +18,7 @@ def add_parser(subparsers: Any) -> None:
         "replay",
         help="publish a recording as the devices did",
         description="Publish triggers, images, poses and calibration of a recording with their "
-        "timing, and the time on /clock. It begins when somebody listens. Nodes that shall live "
+        "timing, and the time on /clock. It begins when somebody listens. Nodes that are to live "
         "in the recording's time get use_sim_time. A calibration in force in the graph stays so, "
         "and the recording's is not played. synchronizer and reconstruct make stacks and "
         "clouds of a replay as of a live scan; nobody asked for them by `slrig scan`, so "
@@ -36,11 +36,11 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--all", action="store_true", help="verdicts and reports as well, not only the devices'"
     )
-    parser.add_argument(
-        "--wait", type=float, default=10.0, metavar="S",
-        help="at most so long, for listeners at the start and for their acknowledgements at the "
-        "end; 0: not at all (default: 10)",
-    )  # fmt: skip
+    text = (
+        "longest wait for listeners at the start, and for their acknowledgements at the end; "
+        "0: none (default: 10)"
+    )
+    parser.add_argument("--wait", type=float, default=10.0, metavar="S", help=text)
     add_client_arguments(parser)
     parser.set_defaults(run=run)
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import os
 import signal
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
+from sl_bringup.graph.client_process import add_domain_arguments
 from sl_bringup.graph.console import INTERRUPTED, complain, say
 from sl_bringup.graph.graph import Graph, GraphOptions
 from sl_bringup.graph.graph_config import Changes
@@ -27,17 +27,11 @@ def add_graph_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--surface", default="", help="part on the bench (groove, coin, plate, ...)"
     )
+    add_domain_arguments(parser)
+    text = "all that follows is passed on to every node"
     parser.add_argument(
-        "--domain", type=int, default=int(os.environ.get("ROS_DOMAIN_ID") or 0),
-        help="ROS domain, 0 to 101 (default: ROS_DOMAIN_ID, else 0)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--network", action="store_true", help="open to other machines; else loopback only"
+        "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...", help=text
     )
-    parser.add_argument(
-        "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...",
-        help="all that follows is passed on to every node",
-    )  # fmt: skip
 
 
 def graph_options(args: argparse.Namespace) -> GraphOptions:

@@ -17,19 +17,25 @@ from sl_bringup.graph.transport import Transport, process_environment
 from sl_common.topics import NAMESPACE
 
 
+def add_domain_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments that say where a graph can be reached."""
+    domain = int(os.environ.get("ROS_DOMAIN_ID") or 0)
+    text = "ROS domain, 0 to 101 (default: ROS_DOMAIN_ID, else 0)"
+    parser.add_argument("--domain", type=int, default=domain, help=text)
+    text = "open to other machines; else loopback only"
+    parser.add_argument("--network", action="store_true", help=text)
+
+
 def add_client_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments that say which graph is meant."""
     parser.add_argument(
-        "--namespace", type=lambda text: "/" + text.strip("/"), default=NAMESPACE,
-        help="of the rig (default: /sl)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--domain", type=int, default=int(os.environ.get("ROS_DOMAIN_ID") or 0),
-        help="ROS domain, 0 to 101 (default: ROS_DOMAIN_ID, else 0)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--network", action="store_true", help="open to other machines; else loopback only"
+        "--namespace", type=_namespace, default=NAMESPACE, help="of the rig (default: /sl)"
     )
+    add_domain_arguments(parser)
+
+
+def _namespace(text: str) -> str:
+    return "/" + text.strip("/")
 
 
 def transport_of(args: argparse.Namespace) -> Transport:

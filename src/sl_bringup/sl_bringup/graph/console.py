@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import sys
 import time
-from types import TracebackType
 
 _BAR = 24
-#: Redraws a second on a terminal; elsewhere (logs) a line every so many seconds.
+#: Time between redraws on a terminal, and between lines elsewhere (logs).
 _REDRAW_S, _LOG_S = 0.1, 5.0
 
 #: Exit status of a command that was interrupted.
@@ -26,8 +25,35 @@ def complain(line: str) -> None:
     sys.stderr.flush()
 
 
-class ProgressLine:
-    """ProgressLine of counted work on standard error; a bar on a terminal, lines in a log.
+class StatusLine:
+    """How work stands: a line that overwrites itself on a terminal, lines in a log now and then.
+
+    Parameters
+    ----------
+    what : str
+        The work.
+    """
+
+    def __init__(self, what: str) -> None:
+        self._what, self._told = what, ""
+        self._terminal = sys.stderr.isatty()
+        self._next_s = time.monotonic() + (0.0 if self._terminal else _LOG_S)
+
+    def show(self, text: str) -> None:
+        """Tell how it stands, not too often; a log hears of it when it has changed."""
+        if time.monotonic() < self._next_s or (text == self._told and not self._terminal):
+            return
+        self._next_s = time.monotonic() + (_REDRAW_S if self._terminal else _LOG_S)
+        self._told = text
+        if self._terminal:
+            sys.stderr.write(f"\r{self._what}: {text} ")
+            sys.stderr.flush()
+        else:
+            complain(f"{self._what}: {text}")
+
+
+class ProgressLine(StatusLine):
+    """Counted work, with a bar on a terminal; a context manager.
 
     Parameters
     ----------
@@ -40,64 +66,24 @@ class ProgressLine:
     """
 
     def __init__(self, what: str, total: int, unit: str) -> None:
-        self._what, self._total, self._unit = what, max(total, 1), unit
-        self._done = 0
-        self._terminal = sys.stderr.isatty()
-        self._shown_s = time.monotonic()
+        super().__init__(what)
+        self._total, self._unit, self._done = max(total, 1), unit, 0
 
     def __enter__(self) -> ProgressLine:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._terminal and self._done:
+            self._next_s = 0.0  # the last step in any case
             self._show()
             sys.stderr.write("\n")
 
     def step(self) -> None:
         """One more is done."""
         self._done += 1
-        now_s = time.monotonic()
-        if now_s - self._shown_s >= (_REDRAW_S if self._terminal else _LOG_S):
-            self._shown_s = now_s
-            self._show()
+        self._show()
 
     def _show(self) -> None:
         done = min(self._done, self._total)
-        counted = f"{done}/{self._total} {self._unit}"
-        if self._terminal:
-            bar = "#" * (_BAR * done // self._total)
-            sys.stderr.write(f"\r{self._what} [{bar:<{_BAR}}] {counted}")
-        else:
-            sys.stderr.write(f"{self._what}: {counted}\n")
-        sys.stderr.flush()
-
-
-class StatusLine:
-    """How work stands that has no known end: a line that overwrites itself, in a log now and then.
-
-    Parameters
-    ----------
-    what : str
-        The work.
-    """
-
-    def __init__(self, what: str) -> None:
-        self._what = what
-        self._terminal = sys.stderr.isatty()
-        self._next_s = time.monotonic() + _LOG_S
-        self._told = ""
-
-    def show(self, text: str) -> None:
-        """Tell how it stands; a log hears of it when it has changed."""
-        if self._terminal:
-            sys.stderr.write(f"\r{self._what}: {text} ")
-            sys.stderr.flush()
-        elif time.monotonic() >= self._next_s and text != self._told:
-            self._next_s = time.monotonic() + _LOG_S
-            self._told = text
-            complain(f"{self._what}: {text}")
+        bar = f"[{'#' * (_BAR * done // self._total):<{_BAR}}] " if self._terminal else ""
+        self.show(f"{bar}{done}/{self._total} {self._unit}")

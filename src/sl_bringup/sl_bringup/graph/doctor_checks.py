@@ -1,4 +1,4 @@
-"""The checks of ``slrig doctor``: each says what it found and, where it is bad, what mends it."""
+"""The checks of ``slrig doctor``: what each found and, where it is bad, the remedy."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ LIBRARIES = {
     **{"usb.core": "pyusb", "serial": "pyserial"},
 }
 INSTALL = "make venv"
-#: What is found when it can be imported, and what mends it when not.
+#: What to look for: the module that shows it is there, and the remedy when it is not.
 ROS_MODULES = {
     "rclpy": ("rclpy", INSTALL + "   (or source a ROS 2 Jazzy workspace)"),
     "middleware": ("rmw_dds_common", INSTALL),
@@ -63,7 +63,7 @@ class Finding:
 
 
 class Trouble(Exception):
-    """What stops a check, and what mends it: the check's last finding, and a bad one."""
+    """Ends a check with a bad finding: what is wrong, and the remedy."""
 
     def __init__(self, text: str, remedy: str) -> None:
         super().__init__(text)
@@ -101,7 +101,7 @@ def python() -> Iterator[Finding]:
     version = ".".join(map(str, sys.version_info[:3]))
     low, high = PYTHON_RANGE
     if not low <= sys.version_info[:2] <= high:
-        remedy = "install Python 3.12 and make the environment anew: make distclean venv"
+        remedy = "install Python 3.12 and make the environment again: make distclean venv"
         raise Trouble(f"{version}; the wheels of ROS are for 3.11-3.13", remedy)
     yield Finding("ok", "python", f"{version} in {sys.prefix}")
 
@@ -167,7 +167,7 @@ def configuration(options: GraphOptions) -> Iterator[Finding]:
         # A directory of its own: the files of a running graph stay as they are.
         config = write_config(options.source, options.directory / "doctor", options.changes)
     except SlError as error:
-        raise Trouble(str(error), "mend the file") from None
+        raise Trouble(str(error), "correct the file") from None
     yield Finding("ok", "configuration", str(options.source))
     if not options.bench:
         node = f"{options.changes.namespace}/calibration"

@@ -1,6 +1,6 @@
-"""The doctor's look at the devices: what there is, how it is, what is wrong, and what mends it.
+"""The doctor's look at the devices: what is there, its state, what is wrong, and the remedy.
 
-Devices are asked, never moved. Of a graph that runs they are its own; it tells how they are.
+Devices are asked, never moved. Those of a running graph are left alone: its nodes report on them.
 """
 
 from __future__ import annotations

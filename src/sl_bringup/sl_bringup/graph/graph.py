@@ -10,7 +10,6 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import IO
 
 from sl_bringup.graph.graph_config import (
@@ -72,14 +71,14 @@ class GraphOptions:
 
 
 def client_command(module: str, *arguments: str) -> tuple[str, ...]:
-    """Command of a ROS client.
+    """Command that runs a module of ours as a process.
 
     Parameters
     ----------
     module : str
-        The client's module.
+        With a `main`.
     *arguments : str
-        Its own.
+        The module's own.
     """
     return (sys.executable, "-m", module, *arguments)
 
@@ -145,12 +144,7 @@ class Graph:
             raise
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self._stop()
 
     async def ready(self, timeout_s: float) -> bool:
@@ -221,9 +215,8 @@ class Graph:
         return config
 
     def _start_bench(self, config: Path) -> None:
-        directory = str(self._options.directory)
-        command = (sys.executable, "-m", "sl_bench.process.bench", "--config", str(config),
-                   "--runtime-dir", directory)  # fmt: skip
+        places = ("--config", str(config), "--runtime-dir", str(self._options.directory))
+        command = client_command("sl_bench.process.bench", *places)
         self.supervisor.start(Process("bench", command, process_environment({}), self._listen))
 
     def _listen(self, line: str) -> None:
@@ -234,10 +227,9 @@ class Graph:
             self._bench_ready.set()
 
     def _start_node(self, name: str, module: str, config: Path) -> None:
-        command = (sys.executable, "-m", module, "--ros-args", "--params-file", str(config),
-                   *self._options.changes.ros_args)  # fmt: skip
+        ros_args = ("--ros-args", "--params-file", str(config), *self._options.changes.ros_args)
         environment = process_environment(self._options.transport.environment(name))
-        self.supervisor.start(Process(name, command, environment))
+        self.supervisor.start(Process(name, client_command(module, *ros_args), environment))
 
 
 def lock_directory(directory: Path) -> IO[str]:

@@ -92,7 +92,7 @@ def runtime_directory(domain: int) -> Path:
 def started_nodes(source: Path) -> dict[str, str]:
     """Return the nodes that a configuration starts and their modules, in the order of the light.
 
-    Images may come from another program's camera driver, and a part may lie still without a stage.
+    Another program's camera driver may publish the images, and a rig may do without a stage.
 
     Raises
     ------
@@ -183,7 +183,7 @@ def _checked(document: Any, source: Path) -> dict[str, Any]:
 
 
 def _resolve(document: dict[str, Any], node: str, name: str, base: Path) -> None:
-    """Make a relative path absolute: the copy lies elsewhere."""
+    """Make a relative path absolute: the copy is elsewhere."""
     parameters = document.get(node, {}).get("ros__parameters", {})
     if parameters.get(name):
         parameters[name] = str((base / str(parameters[name])).resolve())

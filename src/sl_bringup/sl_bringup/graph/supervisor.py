@@ -14,7 +14,6 @@ import signal
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import TracebackType
 
 #: Lines longer than this are cut: a process that writes no line ends must not fill the memory.
 MAX_LINE_BYTES = 1 << 16
@@ -33,7 +32,7 @@ class Process:
     command : sequence of str
         Program and arguments.
     environment : mapping
-        Its whole environment.
+        All variables of its environment.
     on_line : callable, optional
         Gets every line that it writes.
     """
@@ -53,7 +52,7 @@ class Timing:
     backoff_s, backoff_limit_s : float
         Wait before the first restart; it doubles with every further one up to the limit.
     steady_s : float
-        A process that lived so long starts with the shortest wait again.
+        A process that lived this long starts with the shortest wait again.
     interrupt_s, terminate_s : float
         Patience after SIGINT and after SIGTERM.
     """
@@ -90,12 +89,7 @@ class Supervisor:
     async def __aenter__(self) -> Supervisor:
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.stop()
 
     def start(self, process: Process) -> None:
@@ -162,9 +156,13 @@ class Supervisor:
                 process.on_line(line)
 
     async def _end(self, name: str, child: asyncio.subprocess.Process) -> None:
-        steps = ((signal.SIGINT, self._timing.interrupt_s),
-                 (signal.SIGTERM, self._timing.terminate_s), (signal.SIGKILL, 5.0))  # fmt: skip
-        for number, patience_s in steps:
+        timing = self._timing
+        steps = {
+            signal.SIGINT: timing.interrupt_s,
+            signal.SIGTERM: timing.terminate_s,
+            signal.SIGKILL: 5.0,
+        }
+        for number, patience_s in steps.items():
             if child.returncode is not None:
                 return
             if number != signal.SIGINT:

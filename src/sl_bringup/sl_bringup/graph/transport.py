@@ -47,7 +47,7 @@ ALLOCATOR = {
     "MALLOC_TOP_PAD_": str(4 * MIB),
 }
 
-#: Every process announces itself so often, not each 3 s: a newcomer that missed the first
+#: Time between two announcements of a process, not 3 s: a newcomer that missed the first
 #: announcements, as on a busy machine it does, would wait for the next (``docs/transport.md``).
 ANNOUNCEMENT_S = 1
 
@@ -127,7 +127,7 @@ class Transport:
 
 
 def profile_xml(segment: int, network: bool) -> str:
-    """Fast DDS profile of a process with so many bytes of shared memory.
+    """Fast DDS profile of a process.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def clean_stale_segments(directory: Path = SHM_DIRECTORY, min_age_s: float = 10.
     Parameters
     ----------
     directory : Path
-        Where shared memory lies.
+        Where shared memory is.
     min_age_s : float
         Age from which a file may go, seconds.
     """
