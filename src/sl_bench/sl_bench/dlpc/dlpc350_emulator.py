@@ -14,14 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_bench.dlpc.dlpc_emulator import (
-    BAD_INDEX,
-    INVALID_PARAMETER,
-    NOT_PRESENT,
-    WRONG_MODE,
-    DlpcEmulator,
-    Refusal,
-)
+from sl_bench.dlpc.dlpc_emulator import DlpcEmulator, Error, Refusal, invalid
 from sl_bench.dlpc.sequencer import Mirrors, OnExposure, Program, Slot
 from sl_common.clock import Clock
 from sl_projector.dlpc.dmd import dmd_model
@@ -116,12 +109,12 @@ class Dlpc350Emulator(DlpcEmulator):
 
     def _set_source(self, data: bytes) -> None:
         if data[0] not in (0, 3):
-            raise Refusal(INVALID_PARAMETER, "source")
+            raise invalid("source")
         self._source, self._valid = data[0], False
 
     def _set_trigger_mode(self, data: bytes) -> None:
         if data[0] > 4:
-            raise Refusal(INVALID_PARAMETER, "trigger mode")
+            raise invalid("trigger mode")
         self._trigger_mode, self._valid = data[0], False
 
     def _open_mailbox(self, data: bytes) -> None:
@@ -130,17 +123,17 @@ class Dlpc350Emulator(DlpcEmulator):
     def _set_address(self, data: bytes) -> None:
         (self._address,) = struct.unpack_from("<H", data)
         if self._address >= MAX_ENTRIES:
-            raise Refusal(BAD_INDEX, "address")
+            raise Refusal(Error.BAD_INDEX, "address")
 
     def _take_images(self, data: bytes) -> None:
         if self._mailbox != 1 or len(data) > MAX_IMAGES:
-            raise Refusal(WRONG_MODE, "the image table's mailbox is not open")
+            raise Refusal(Error.WRONG_MODE, "the image table's mailbox is not open")
         # The controller has exactly two entries the other way round.
         self._images = dict(enumerate(data[::-1] if len(data) == 2 else data))
 
     def _take_entry(self, data: bytes) -> None:
         if self._mailbox != 3:
-            raise Refusal(WRONG_MODE, "the variable exposure mailbox is not open")
+            raise Refusal(Error.WRONG_MODE, "the variable exposure mailbox is not open")
         self._entries[self._address] = struct.unpack_from("<III", data)
 
     def _configure(self, data: bytes) -> None:
@@ -186,7 +179,7 @@ class Dlpc350Emulator(DlpcEmulator):
             self.aborted = False
             return
         if not (self._valid and self._mode == 1 and self._source == 3) or self._power:
-            raise Refusal(NOT_PRESENT, "nothing valid to show")
+            raise Refusal(Error.NOT_PRESENT, "nothing valid to show")
         count, _, endless = self._config
         (delay,) = struct.unpack("<I", self._registers[0x1A35])
         self.start(

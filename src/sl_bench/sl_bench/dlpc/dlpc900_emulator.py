@@ -24,19 +24,12 @@ from sl_bench.dlpc.dlpc900_registers import (
     TRIGGER_OUT,
 )
 from sl_bench.dlpc.dlpc_emulator import (
-    BAD_BIT,
-    BAD_DARK,
-    BAD_DEFINITION,
-    BAD_DELAY,
-    BAD_EXPOSURE,
-    BAD_INDEX,
     ERROR_CODE,
     ERROR_TEXT,
-    INVALID_PARAMETER,
-    NOT_PRESENT,
-    WRONG_MODE,
     DlpcEmulator,
+    Error,
     Refusal,
+    invalid,
 )
 from sl_bench.dlpc.sequencer import Mirrors, OnExposure, Program, Slot
 from sl_common.clock import Clock
@@ -129,16 +122,16 @@ class Dlpc900Emulator(DlpcEmulator):
     def _store(self, command: int, data: bytes) -> None:
         size = len(self._registers[command])
         if len(data) < size:
-            raise Refusal(INVALID_PARAMETER, f"{len(data)} data bytes; expected {size}")
+            raise invalid(f"{len(data)} data bytes; expected {size}")
         if command in TRIGGER_OUT.values():
             inverted, rising, falling = struct.unpack_from("<Bhh", data)
             if not (-20 <= rising <= 20000 and -20 <= falling <= 20000):
-                raise Refusal(BAD_DELAY)
+                raise Refusal(Error.BAD_DELAY)
             if inverted & 1 and rising < falling:
-                raise Refusal(BAD_DELAY, "inverted: rising delay below falling delay")
+                raise Refusal(Error.BAD_DELAY, "inverted: rising delay below falling delay")
         value = int.from_bytes(data[:2], "little")
         if command == TRIGGER_IN_DELAY and value < self.model.block_load_us[-1]:
-            raise Refusal(BAD_DELAY)
+            raise Refusal(Error.BAD_DELAY)
         if 0x1A1D <= command <= 0x1A36:
             self._refuse_while_running()
         if command in (FLIP_COLUMNS, FLIP_ROWS, INVERT_DATA):
@@ -149,20 +142,20 @@ class Dlpc900Emulator(DlpcEmulator):
         if data[0] == 2:
             self.power_cycle()
         elif data[0] > 2:
-            raise Refusal(INVALID_PARAMETER)
+            raise Refusal(Error.INVALID_PARAMETER)
         else:
             self.halt()
             self._power = data[0]
 
     def _set_idle(self, data: bytes) -> None:
         if data[0] not in (0, 1, 3):
-            raise Refusal(INVALID_PARAMETER)
+            raise Refusal(Error.INVALID_PARAMETER)
         self._refuse_while_running()
         self._idle = int(data[0] == 1)
 
     def _set_mode(self, data: bytes) -> None:
         if data[0] > _ON_THE_FLY:
-            raise Refusal(INVALID_PARAMETER)
+            raise Refusal(Error.INVALID_PARAMETER)
         self._refuse_while_running()
         if data[0] != self._mode:
             self._definitions, self._table, self._paused_at = {}, (), 0
@@ -172,7 +165,7 @@ class Dlpc900Emulator(DlpcEmulator):
 
     def _define(self, data: bytes) -> None:
         if self._mode not in _MODE_PATTERNS:
-            raise Refusal(WRONG_MODE)
+            raise Refusal(Error.WRONG_MODE)
         self._refuse_while_running()
         (index,) = struct.unpack_from("<H", data)
         options = data[5]
@@ -191,17 +184,17 @@ class Dlpc900Emulator(DlpcEmulator):
 
     def _check_slot(self, index: int, slot: Slot) -> None:
         if index >= self.model.max_patterns:
-            raise Refusal(BAD_INDEX)
+            raise Refusal(Error.BAD_INDEX)
         if slot.bit > _LAST_PLANE:
-            raise Refusal(BAD_BIT)
+            raise Refusal(Error.BAD_BIT)
         if slot.bit + slot.depth > _LAST_PLANE + 1:
-            raise Refusal(BAD_DEFINITION, "bit position and depth leave the image")
+            raise Refusal(Error.BAD_DEFINITION, "bit position and depth leave the image")
         if slot.exposure_us < self._least_exposure_us(slot.depth):
-            raise Refusal(BAD_EXPOSURE)
+            raise Refusal(Error.BAD_EXPOSURE)
         if 0 < slot.dark_us < self.model.min_dark_us:
-            raise Refusal(BAD_DARK)
+            raise Refusal(Error.BAD_DARK)
         if self._mode == _ON_THE_FLY and slot.image >= MAX_FLY_IMAGES:
-            raise Refusal(INVALID_PARAMETER, f"image {slot.image} on the fly")
+            raise invalid(f"image {slot.image} on the fly")
 
     def _least_exposure_us(self, depth: int) -> int:
         if depth > 1:
@@ -211,14 +204,14 @@ class Dlpc900Emulator(DlpcEmulator):
 
     def _configure(self, data: bytes) -> None:
         if self._mode not in _MODE_PATTERNS:
-            raise Refusal(WRONG_MODE)
+            raise Refusal(Error.WRONG_MODE)
         self._refuse_while_running()
         entries, exposures = struct.unpack_from("<HI", data)
         entries &= 0x7FF
         if not 1 <= entries <= self.model.max_patterns:
-            raise Refusal(BAD_INDEX)
+            raise Refusal(Error.BAD_INDEX)
         if missing := [i for i in range(entries) if i not in self._definitions]:
-            raise Refusal(BAD_DEFINITION, f"entry {missing[0]} is not defined")
+            raise Refusal(Error.BAD_DEFINITION, f"entry {missing[0]} is not defined")
         table = tuple(self._definitions[i] for i in range(entries))
         places = [(s.image, s.bit, s.depth) for s in table]
         if self.strict and places != [(s.image, s.bit, s.depth) for s in self._table]:
@@ -234,9 +227,9 @@ class Dlpc900Emulator(DlpcEmulator):
         count, exposures = struct.unpack_from("<HI", data)
         order = [int.from_bytes(data[at : at + 2], "little") for at in range(6, len(data) - 1, 2)]
         if not 1 <= count <= len(order):
-            raise Refusal(INVALID_PARAMETER, f"{len(order)} indices; it says {count}")
+            raise invalid(f"{len(order)} indices; it says {count}")
         if any(index not in self._definitions for index in order[:count]):
-            raise Refusal(BAD_INDEX)
+            raise Refusal(Error.BAD_INDEX)
         self._table = tuple(self._definitions[index] for index in order[:count])
         self._exposures, self._paused_at = exposures, 0
 
@@ -244,7 +237,7 @@ class Dlpc900Emulator(DlpcEmulator):
 
     def _begin_image(self, controller: int, data: bytes) -> None:
         if self._mode != _ON_THE_FLY:
-            raise Refusal(WRONG_MODE)
+            raise Refusal(Error.WRONG_MODE)
         self._refuse_while_running()
         self._cache.clear()
         self._memory.begin(controller, data)
@@ -278,16 +271,16 @@ class Dlpc900Emulator(DlpcEmulator):
             self.aborted = False
             self._paused_at = 0
         else:
-            raise Refusal(INVALID_PARAMETER)
+            raise Refusal(Error.INVALID_PARAMETER)
 
     def _start(self) -> None:
         if self._mode not in _MODE_PATTERNS or self._power or self._idle:
-            raise Refusal(WRONG_MODE)
+            raise Refusal(Error.WRONG_MODE)
         if not self._table:
-            raise Refusal(NOT_PRESENT, "the pattern table is empty")
+            raise Refusal(Error.NOT_PRESENT, "the pattern table is empty")
         used = {slot.image for slot in self._table}
         if missing := {image for image in used if not self._memory.holds(image)}:
-            raise Refusal(NOT_PRESENT, f"image {min(missing)} is not loaded")
+            raise Refusal(Error.NOT_PRESENT, f"image {min(missing)} is not loaded")
         output = self._registers[TRIGGER_OUT[self._camera_output]]
         self.start(
             Program(

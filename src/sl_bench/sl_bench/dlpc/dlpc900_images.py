@@ -11,7 +11,7 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from sl_bench.dlpc.dlpc_emulator import BAD_COMPRESSION, INVALID_PARAMETER, Refusal
+from sl_bench.dlpc.dlpc_emulator import Error, Refusal, invalid
 
 HEADER_BYTES = 48
 SIGNATURE = b"Spld"
@@ -27,9 +27,7 @@ class _Stream:
     def byte(self) -> int:
         """Take one byte."""
         if self.at >= len(self._data):
-            raise Refusal(
-                INVALID_PARAMETER, f"image data ends after {self.at} bytes without an end mark"
-            )
+            raise invalid(f"image data ends after {self.at} bytes without an end mark")
         self.at += 1
         return self._data[self.at - 1]
 
@@ -37,9 +35,7 @@ class _Stream:
         """Take ``count`` bytes."""
         part = self._data[self.at : self.at + count]
         if len(part) < count:
-            raise Refusal(
-                INVALID_PARAMETER, f"image data ends within {count} pixel bytes at {self.at}"
-            )
+            raise invalid(f"image data ends within {count} pixel bytes at {self.at}")
         self.at += count
         return part
 
@@ -59,9 +55,7 @@ class _Canvas:
 
     def _room(self, count: int) -> slice:
         if self.at + count > len(self.pixels) or self.at % self.width + count > self.width:
-            raise Refusal(
-                INVALID_PARAMETER, f"{count} pixels at pixel {self.at} leave the line or the image"
-            )
+            raise invalid(f"{count} pixels at pixel {self.at} leave the line or the image")
         self.at += count
         return slice(self.at - count, self.at)
 
@@ -77,7 +71,7 @@ class _Canvas:
     def copy_above(self, count: int) -> None:
         """Put ``count`` pixels of the line above."""
         if self.at < self.width:
-            raise Refusal(INVALID_PARAMETER, "copy from the line above on the first line")
+            raise invalid("copy from the line above on the first line")
         room = self._room(count)
         above = slice(room.start - self.width, room.stop - self.width)
         self.pixels[room] = self.pixels[above]
@@ -127,7 +121,7 @@ def _uncompressed(data: bytes, width: int, height: int) -> NDArray[np.uint8]:
         if len(data) == stride * height:
             rows = np.frombuffer(data, np.uint8).reshape(height, stride)
             return rows[:, :line].reshape(-1, 3)
-    raise Refusal(INVALID_PARAMETER, f"{len(data)} bytes of pixels; expected {padded * height}")
+    raise invalid(f"{len(data)} bytes of pixels; expected {padded * height}")
 
 
 def decode_image(
@@ -157,15 +151,13 @@ def decode_image(
         When the controller would refuse or garble it.
     """
     if len(stream) < HEADER_BYTES or stream[:4] != SIGNATURE:
-        raise Refusal(
-            INVALID_PARAMETER, f"image begins with {stream[:4]!r}; expected {SIGNATURE!r}"
-        )
+        raise invalid(f"image begins with {stream[:4]!r}; expected {SIGNATURE!r}")
     columns, rows, counted = struct.unpack_from("<HHI", stream, 4)
     if (columns, rows) != (width, height):
-        raise Refusal(INVALID_PARAMETER, f"image of {columns}x{rows}; expected {width}x{height}")
+        raise invalid(f"image of {columns}x{rows}; expected {width}x{height}")
     data = stream[HEADER_BYTES:]
     if (strict or stream[25] == 0) and counted not in (len(data), len(stream)):
-        raise Refusal(INVALID_PARAMETER, f"header counts {counted} bytes; got {len(data)}")
+        raise invalid(f"header counts {counted} bytes; got {len(data)}")
     pixels = _pixels(stream[25], data, width, height)
     # On the wire planes 16-23 come first.
     return np.ascontiguousarray(pixels[:, ::-1].T).reshape(3, height, width)
@@ -180,10 +172,8 @@ def _pixels(compression: int, data: bytes, width: int, height: int) -> NDArray[n
     elif compression == 2:
         _enhanced_run_length(stream, canvas)
     else:
-        raise Refusal(BAD_COMPRESSION, f"compression {compression}; expected 0, 1 or 2")
+        raise Refusal(Error.BAD_COMPRESSION, f"compression {compression}; expected 0, 1 or 2")
     canvas.end_line()
     if canvas.at != len(canvas.pixels):
-        raise Refusal(
-            INVALID_PARAMETER, f"image ends after {canvas.at} of {len(canvas.pixels)} pixels"
-        )
+        raise invalid(f"image ends after {canvas.at} of {len(canvas.pixels)} pixels")
     return canvas.pixels

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sl_bench.dlpc.dlpc900_images import decode_image
-from sl_bench.dlpc.dlpc_emulator import INVALID_PARAMETER, NOT_PRESENT, Refusal
+from sl_bench.dlpc.dlpc_emulator import Error, Refusal, invalid
 from sl_projector.dlpc.dmd import DmdModel
 
 MAX_FLY_IMAGES = 18
@@ -85,7 +85,7 @@ class ImageMemory:
         target = self._controller(controller)
         image, total = struct.unpack_from("<HI", data)
         if image & 0x1F >= MAX_FLY_IMAGES:
-            raise Refusal(INVALID_PARAMETER, f"image {image} on the fly")
+            raise invalid(f"image {image} on the fly")
         target.images.pop(image & 0x1F, None)
         target.upload = _Upload(image & 0x1F, total)
 
@@ -105,9 +105,9 @@ class ImageMemory:
         if not count:  # some hosts (Pycrafter6500) end with an empty part
             return
         if upload is None:
-            raise Refusal(NOT_PRESENT, "image data without its start")
+            raise Refusal(Error.NOT_PRESENT, "image data without its start")
         if len(data) - 2 < count:
-            raise Refusal(INVALID_PARAMETER, f"chunk of {len(data) - 2} bytes; it says {count}")
+            raise invalid(f"chunk of {len(data) - 2} bytes; it says {count}")
         upload.data += data[2 : 2 + count]
         if len(upload.data) >= upload.total:
             target.upload = None
@@ -115,12 +115,10 @@ class ImageMemory:
 
     def _controller(self, number: int) -> _Controller:
         if number >= len(self._controllers):
-            raise Refusal(INVALID_PARAMETER, "there is no secondary controller")
+            raise invalid("there is no secondary controller")
         return self._controllers[number]
 
     def _decoded(self, upload: _Upload) -> NDArray[np.uint8]:
         if len(upload.data) > upload.total:
-            raise Refusal(
-                INVALID_PARAMETER, f"{len(upload.data)} bytes of image; announced {upload.total}"
-            )
+            raise invalid(f"{len(upload.data)} bytes of image; announced {upload.total}")
         return decode_image(bytes(upload.data), self._width, self._height, strict=self._strict)

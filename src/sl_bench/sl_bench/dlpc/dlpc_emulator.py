@@ -11,6 +11,7 @@ import struct
 import threading
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
+from enum import IntEnum
 from typing import ClassVar
 
 import numpy as np
@@ -25,30 +26,43 @@ BUFFER = 512
 READ, REPLY_WANTED, NACK = 0x80, 0x40, 0x20
 ERROR_CODE, ERROR_TEXT = 0x0100, 0x0101
 
-NO_ERROR, INVALID_COMMAND, WRONG_MODE, INVALID_PARAMETER, NOT_PRESENT = 0, 3, 5, 6, 7
-BAD_COMPRESSION, BAD_BIT, BAD_DARK, BAD_DELAY, BAD_EXPOSURE = 9, 10, 12, 13, 14
-BAD_INDEX, BAD_DEFINITION = 15, 16
-_ERROR_TEXTS = {
-    INVALID_COMMAND: "Invalid command number",
-    WRONG_MODE: "Command not allowed in current mode",
-    INVALID_PARAMETER: "Invalid command parameter",
-    NOT_PRESENT: "Item referred by the parameter is not present",
-    BAD_BIT: "Pattern bit number out of range",
-    BAD_DARK: "Pattern dark time out of range",
-    BAD_DELAY: "Signal delay out of range",
-    BAD_EXPOSURE: "Pattern exposure out of range",
-    BAD_INDEX: "Pattern number out of range",
-    BAD_DEFINITION: "Invalid pattern definition",
-}
+
+class Error(IntEnum):
+    """TI's error codes (command 0x0100) and their texts."""
+
+    text: str
+
+    NO_ERROR = 0, ""
+    INVALID_COMMAND = 3, "Invalid command number"
+    WRONG_MODE = 5, "Command not allowed in current mode"
+    INVALID_PARAMETER = 6, "Invalid command parameter"
+    NOT_PRESENT = 7, "Item referred by the parameter is not present"
+    BAD_COMPRESSION = 9, "Device failure"
+    BAD_BIT = 10, "Pattern bit number out of range"
+    BAD_DARK = 12, "Pattern dark time out of range"
+    BAD_DELAY = 13, "Signal delay out of range"
+    BAD_EXPOSURE = 14, "Pattern exposure out of range"
+    BAD_INDEX = 15, "Pattern number out of range"
+    BAD_DEFINITION = 16, "Invalid pattern definition"
+
+    def __new__(cls, code: int, text: str) -> Error:  # noqa: D102
+        member = int.__new__(cls, code)
+        member._value_, member.text = code, text
+        return member
 
 
 class Refusal(Exception):
-    """A command that the controller answers with NACK, and TI's error code (command 0x0100)."""
+    """A command that the controller answers with NACK, and its error code."""
 
     def __init__(self, code: int, reason: str = "") -> None:
         self.code = code
-        self.reason = reason or _ERROR_TEXTS.get(code, "Device failure")
+        self.reason = reason or getattr(code, "text", "Device failure")
         super().__init__(self.reason)
+
+
+def invalid(reason: str) -> Refusal:
+    """Return the refusal of an invalid parameter."""
+    return Refusal(Error.INVALID_PARAMETER, reason)
 
 
 class DlpcEmulator(Sequencer):
@@ -87,7 +101,7 @@ class DlpcEmulator(Sequencer):
             self.aborted = False
             self._registers = dict(self.STORED)
             self._pending = bytearray()
-            self._error, self._error_text = NO_ERROR, ""
+            self._error, self._error_text = int(Error.NO_ERROR), ""
             self._reset()
 
     @abstractmethod
@@ -111,7 +125,7 @@ class DlpcEmulator(Sequencer):
 
     def _refuse_while_running(self) -> None:
         if self.running:
-            raise Refusal(WRONG_MODE, "a sequence is running")
+            raise Refusal(Error.WRONG_MODE, "a sequence is running")
 
     # -- reports ------------------------------------------------------------------------------
 
@@ -147,17 +161,17 @@ class DlpcEmulator(Sequencer):
         command = int.from_bytes(message[:2], "little")
         try:
             if not 2 <= len(message) <= BUFFER - 4:
-                raise Refusal(INVALID_PARAMETER, f"message of {len(message)} bytes")
+                raise invalid(f"message of {len(message)} bytes")
             self.messages += 1
             data = self._execute(command, message[2:], read)
         except Refusal as refusal:
             self._fail(refusal.code, f"0x{command:04X}: {refusal.reason}")
             return b"", NACK
         except (IndexError, struct.error):
-            self._fail(INVALID_PARAMETER, f"0x{command:04X}: {len(message) - 2} data bytes")
+            self._fail(Error.INVALID_PARAMETER, f"0x{command:04X}: {len(message) - 2} data bytes")
             return b"", NACK
         if command not in (ERROR_CODE, ERROR_TEXT):
-            self._error, self._error_text = NO_ERROR, ""
+            self._error, self._error_text = int(Error.NO_ERROR), ""
         return data, 0
 
     def _fail(self, code: int, reason: str) -> None:
@@ -178,4 +192,4 @@ class DlpcEmulator(Sequencer):
         elif (writer := self._writers().get(command)) is not None:
             writer(data)
             return b""
-        raise Refusal(INVALID_COMMAND)
+        raise Refusal(Error.INVALID_COMMAND)

@@ -160,10 +160,8 @@ def ray(device: DeviceData, u: float, v: float) -> Vector:
 
     Parameters
     ----------
-    device : DeviceData
-        The device.
-    u, v : float
-        Observed pixel.
+    device, u, v
+        The device; its pixel.
     """
     du, dv = u - device.centre_px[0], v - device.centre_px[1]
     if device.lens == DIVISION:
@@ -189,10 +187,8 @@ def project(device: DeviceData, x: float, y: float, z: float) -> Vector:
 
     Parameters
     ----------
-    device : DeviceData
-        The device.
-    x, y, z : float
-        The point, part frame.
+    device, x, y, z
+        The device; the point, part frame.
     """
     R, T = device.rotation, device.translation_m
     depth = R[2][0] * x + R[2][1] * y + R[2][2] * z + T[2]
@@ -226,10 +222,8 @@ def hole_distance(surface: SurfaceData, x: float, y: float) -> tuple[float, floa
 
     Parameters
     ----------
-    surface : SurfaceData
-        Of kind HOLES.
-    x, y : float
-        Place on the part.
+    surface, x, y
+        Of kind HOLES; place on it.
     """
     pitch = surface.params[0]
     rows, columns = surface.grid.shape
@@ -246,10 +240,8 @@ def albedo(surface: SurfaceData, x: float, y: float) -> float:
 
     Parameters
     ----------
-    surface : SurfaceData
-        The surface.
-    x, y : float
-        Place on the part.
+    surface, x, y
+        The surface; place on it.
     """
     if surface.kind != HOLES:
         return 1.0
@@ -265,10 +257,8 @@ def rim_distance(surface: SurfaceData, x: float, y: float) -> tuple[float, float
 
     Parameters
     ----------
-    surface : SurfaceData
-        The surface.
-    x, y : float
-        Place on the part.
+    surface, x, y
+        The surface; place on it.
     """
     if surface.kind != HOLES:
         return np.inf, 0.0
@@ -317,10 +307,8 @@ def height_gradient(surface: SurfaceData, x: float, y: float) -> Vector:
 
     Parameters
     ----------
-    surface : SurfaceData
-        Of a kind that is solved for: HOLES or GRID.
-    x, y : float
-        Place on the part.
+    surface, x, y
+        Of a kind that is solved for, HOLES or GRID; place on it.
     """
     if surface.kind == GRID:
         return _grid_height(surface, x, y)
@@ -427,10 +415,8 @@ def first_hit(surface: SurfaceData, o: Vector, d: Vector) -> tuple[float, float,
 
     Parameters
     ----------
-    surface : SurfaceData
-        The surface.
-    o, d : tuple of float
-        Origin and direction, part frame.
+    surface, o, d
+        The surface; origin and direction (x, y, z) of the ray, part frame.
     """
     if surface.kind == PROFILE:
         t, nx, nz = _hit_profile(surface, o[0], o[2], d[0], d[2], 0.0)
@@ -471,10 +457,8 @@ def shadowed(surface: SurfaceData, p: Vector, light: Vector) -> bool:
 
     Parameters
     ----------
-    surface : SurfaceData
-        The surface.
-    p, light : tuple of float
-        Part frame.
+    surface, p, light
+        The surface; (x, y, z) of both points, part frame.
     """
     d = (light[0] - p[0], light[1] - p[1], light[2] - p[2])
     # t is 1 at the light, about 0.1 m away: 1e-7 steps 10 nm off the point's own facet.

@@ -7,6 +7,8 @@ the normal of the reference plane, both in the x-z plane of the world.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,36 +43,33 @@ def looking_down(tilt_deg: float) -> NDArray[np.float64]:
     return np.array([[c, 0.0, s], [0.0, -1.0, 0.0], [s, 0.0, -c]])
 
 
-def _aimed(
-    size: tuple[int, int],
-    focal_px: float,
-    centre_px: tuple[float, float],
-    pitch_m: float,
-    tilt_deg: float,
-    kappa: float,
-    depth_m: float,
-) -> Device:
-    """Put a device so that its middle pixel sees the world's origin at the given depth."""
-    rotation = looking_down(tilt_deg)
-    focal = (focal_px, focal_px)
-    at_origin = Device(size, focal, centre_px, pitch_m, rotation, np.zeros(3), Division(kappa))
-    middle = np.array([(size[0] - 1) / 2, (size[1] - 1) / 2])
-    return Device(
-        size, focal, centre_px, pitch_m, rotation,
-        rotation @ at_origin.rays(middle) * depth_m, Division(kappa),
-    )  # fmt: skip
+def _aimed(device: Device, depth_m: float) -> Device:
+    """Put a device so that its middle pixel sees the world's origin at a depth."""
+    middle = (np.array(device.image_size) - 1) / 2
+    return replace(device, translation_m=device.rotation @ device.rays(middle) * depth_m)
 
 
 def reference_rig() -> Rig:
     """Return the paper's rig with a field of 12 x 9 mm on the world's plane z = 0."""
-    focal_px = PROJECTOR_FOCAL_M / PROJECTOR_PITCH_M
-    depth_m = FIELD_WIDTH_M / PROJECTOR_SIZE[0] * focal_px
-    projector = _aimed(
-        PROJECTOR_SIZE, focal_px, PROJECTOR_CENTRE_PX, PROJECTOR_PITCH_M,
-        PROJECTOR_TILT_DEG, PROJECTOR_KAPPA, depth_m,
-    )  # fmt: skip
-    camera = _aimed(
-        CAMERA_SIZE, CAMERA_FOCAL_M / CAMERA_PITCH_M, CAMERA_CENTRE_PX, CAMERA_PITCH_M,
-        CAMERA_TILT_DEG, CAMERA_KAPPA, CAMERA_DISTANCE_M,
-    )  # fmt: skip
-    return Rig(camera, projector)
+    projector_px = PROJECTOR_FOCAL_M / PROJECTOR_PITCH_M
+    projector = Device(
+        PROJECTOR_SIZE,
+        (projector_px, projector_px),
+        PROJECTOR_CENTRE_PX,
+        PROJECTOR_PITCH_M,
+        looking_down(PROJECTOR_TILT_DEG),
+        np.zeros(3),
+        Division(PROJECTOR_KAPPA),
+    )
+    camera_px = CAMERA_FOCAL_M / CAMERA_PITCH_M
+    camera = Device(
+        CAMERA_SIZE,
+        (camera_px, camera_px),
+        CAMERA_CENTRE_PX,
+        CAMERA_PITCH_M,
+        looking_down(CAMERA_TILT_DEG),
+        np.zeros(3),
+        Division(CAMERA_KAPPA),
+    )
+    depth_m = FIELD_WIDTH_M / PROJECTOR_SIZE[0] * projector_px
+    return Rig(_aimed(camera, CAMERA_DISTANCE_M), _aimed(projector, depth_m))

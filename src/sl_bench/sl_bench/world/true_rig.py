@@ -16,6 +16,15 @@ from sl_common.documents import dump_document, read_document, write_text
 from sl_common.errors import CalibrationError
 from sl_reconstruct.model.rig import BrownConrady, Device, Division, Rig
 
+_KEYS = (
+    "image_size",
+    "focal_length_px",
+    "pixel_pitch_m",
+    "image_centre_px",
+    "rotation",
+    "translation_m",
+)
+
 
 def rig_document(rig: Rig) -> dict[str, Any]:
     """Return the rig as the calibration file has it, plain numbers and lists."""
@@ -27,10 +36,10 @@ def write_rig(path: str | Path, rig: Rig) -> None:
 
     Parameters
     ----------
-    path : str or Path
+    path : path
         The file.
     rig : Rig
-        The true rig.
+        The true one.
     """
     document = rig_document(rig) | {"made_from": {"bench": "the simulated world's true rig"}}
     write_text(Path(path), dump_document(document))
@@ -54,23 +63,12 @@ def read_rig(path: str | Path) -> Rig:
 
 
 def _document(device: Device) -> dict[str, Any]:
-    lens: dict[str, Any]
-    if isinstance(device.lens, Division):
-        lens = {"model": "division", "kappa": float(device.lens.kappa)}
-    else:
-        lens = {
-            "model": "brown_conrady",
-            "distortion": [float(c) for c in device.lens.coefficients],
-        }
-    return {
-        **lens,
-        "image_size": [int(side) for side in device.image_size],
-        "focal_length_px": [float(f) for f in device.focal_length_px],
-        "pixel_pitch_m": float(device.pixel_pitch_m),
-        "image_centre_px": [float(c) for c in device.image_centre_px],
-        "rotation": device.rotation.tolist(),
-        "translation_m": device.translation_m.tolist(),
-    }
+    lens: dict[str, Any] = (
+        {"model": "division", "kappa": float(device.lens.kappa)}
+        if isinstance(device.lens, Division)
+        else {"model": "brown_conrady", "distortion": [float(c) for c in device.lens.coefficients]}
+    )
+    return lens | {key: np.asarray(getattr(device, key)).tolist() for key in _KEYS}
 
 
 def _device(fields: Mapping[str, Any]) -> Device:
@@ -80,15 +78,10 @@ def _device(fields: Mapping[str, Any]) -> Device:
     else:
         k1, k2, p1, p2, k3 = (*map(float, fields["distortion"]), 0.0)[:5]
         lens = BrownConrady((k1, k2, p1, p2, k3))
-    fx, fy = np.broadcast_to(np.asarray(fields["focal_length_px"], dtype=np.float64), 2)
-    width, height = fields["image_size"]
-    u, v = fields["image_centre_px"]
-    return Device(
-        (int(width), int(height)),
-        (float(fx), float(fy)),
-        (float(u), float(v)),
-        float(fields["pixel_pitch_m"]),
-        np.array(fields["rotation"], dtype=np.float64),
-        np.array(fields["translation_m"], dtype=np.float64),
-        lens,
+    size, focal_px, pitch_m, centre_px, rotation, translation_m = (
+        np.asarray(fields[key], dtype=np.float64) for key in _KEYS
     )
+    fx, fy = map(float, np.broadcast_to(focal_px, 2))
+    width, height = map(int, size)
+    u, v = map(float, centre_px)
+    return Device((width, height), (fx, fy), (u, v), float(pitch_m), rotation, translation_m, lens)
