@@ -25,7 +25,7 @@ from sl_reconstruct.measure.region import Region, Selection, select
 from sl_reconstruct.measure.sphere_cylinder import measure_sphere
 from sl_reconstruct.measure.step import measure_step
 from sl_reconstruct.reconstruction.reconstructor import Reconstructor
-from support.uncertainty_scenes import SCENES, z_scores
+from support.scenes.uncertainty_scenes import SCENES, z_scores
 
 EXPOSURE_S = 1.0 / 30.0
 POSES = 10

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sl_bench.dlpc.dlpc900_emulator import Dlpc900Emulator
-from support.dlpc900_bench import VirtualClock
+from support.devices.dlpc900_bench import VirtualClock
 
 # Written out here, not taken from the driver: the header of one blank image of 1024x768 in
 # enhanced RLE, whose rows are copies of the first.

@@ -9,7 +9,7 @@ from sl_bench.world.surfaces import make_surface
 from sl_bench.world.world import World
 from sl_common.errors import ConfigError
 from sl_reconstruct.model.rig import BrownConrady, Rig
-from support.bench_scenes import WINDOW, pixel_grid, small_rig, small_world, tilt
+from support.scenes.bench_scenes import WINDOW, pixel_grid, small_rig, small_world, tilt
 
 FULL = (0, 0, 1600, 1200)
 

@@ -21,7 +21,7 @@ from sl_projector.sequence.pattern_sequence import PatternSequence
 from sl_reconstruct.model.calibration_file import Calibration, rig_hash, save_calibration
 from sl_reconstruct.model.rig import Rig
 from support.paths import DATA, EXAMPLES
-from support.tiny_scans import (
+from support.scenes.tiny_scans import (
     DMD_SIZE,
     HEIGHT_M,
     SLOPE,

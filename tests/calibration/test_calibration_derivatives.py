@@ -14,7 +14,7 @@ from sl_calibration.bundle.stage_model import StagePrior, stage_report
 from sl_calibration.data.solver_input import Holes, Targets
 from sl_common.errors import CalibrationError
 from sl_reconstruct.model.rig import BrownConrady, Device
-from support.calibration_scenes import RIG, Scene
+from support.scenes.calibration_scenes import RIG, Scene
 
 #: Steps for central differences: f, C, kappa, turns, T.
 STEPS = np.array([1e-1] * 2 + [1e-2] * 2 + [1e-12] + [1e-6] * 3 + [1e-7] * 3)

@@ -14,7 +14,7 @@ from sl_calibration.solve.linear_step import Sensor
 from sl_common.errors import CalibrationError
 from sl_reconstruct.model.calibration_file import load_rig
 from sl_reconstruct.model.rig import BrownConrady, Device
-from support.calibration_scenes import CAMERA, PROJECTOR, RIG, grid
+from support.scenes.calibration_scenes import CAMERA, PROJECTOR, RIG, grid
 
 POINTS_M = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * [5e-3, 4e-3, 1e-3]
 

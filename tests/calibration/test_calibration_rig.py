@@ -22,7 +22,15 @@ from sl_calibration.solve.solution_pipeline import solve_rig, thinned
 from sl_calibration.solve.stages import solve_camera
 from sl_reconstruct.model.calibration_file import dump_calibration, parse_calibration
 from sl_reconstruct.model.rig import Device, Rig
-from support.calibration_scenes import CAMERA, HEIGHTS_M, SENSORS, Scene, grid, spoil, triangulate
+from support.scenes.calibration_scenes import (
+    CAMERA,
+    HEIGHTS_M,
+    SENSORS,
+    Scene,
+    grid,
+    spoil,
+    triangulate,
+)
 
 SEEDS = 40
 VOLUME = Volume((-6e-3, -4.5e-3, -1e-3), (6e-3, 4.5e-3, 1e-3))

@@ -29,9 +29,9 @@ from sl_common.errors import CalibrationError, DeviceRefused, SequenceError
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence, named
 from sl_projector.sequence.stack import Stack
 from sl_reconstruct.model.calibration_file import load_calibration, rig_hash
-from support.calibration_bench import HEIGHTS_M, PLACES, START, Bench, FakeRig
-from support.calibration_scenes import RIG
-from support.plate_scenes import drawn, pinhole
+from support.devices.calibration_bench import HEIGHTS_M, PLACES, START, Bench, FakeRig
+from support.scenes.calibration_scenes import RIG
+from support.scenes.plate_scenes import drawn, pinhole
 
 
 @pytest.fixture

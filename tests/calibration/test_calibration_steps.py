@@ -16,7 +16,7 @@ from sl_calibration.solve.solution_pipeline import solve_rig
 from sl_calibration.solve.stages import solve_camera, solve_projector
 from sl_common.errors import CalibrationError
 from sl_reconstruct.model.rig import Device, Division
-from support.calibration_scenes import (
+from support.scenes.calibration_scenes import (
     CAMERA,
     HEIGHTS_M,
     PLATE_XY_M,

@@ -27,8 +27,8 @@ from sl_projector.sequence.pattern_sequence import named
 from sl_projector.sequence.stack import Stack
 from sl_reconstruct.model.calibration_file import Calibration, Covariance
 from sl_reconstruct.model.rig import BrownConrady, Device, Rig
-from support.calibration_bench import HEIGHTS_M, PITCHES, SEQUENCE, START, Bench, look_with
-from support.calibration_scenes import RIG, Scene
+from support.devices.calibration_bench import HEIGHTS_M, PITCHES, SEQUENCE, START, Bench, look_with
+from support.scenes.calibration_scenes import RIG, Scene
 
 GRID = np.stack(np.meshgrid(
     np.linspace(-6e-3, 6e-3, 7), np.linspace(-4.5e-3, 4.5e-3, 5), [-1e-3, 0.0, 1e-3],

@@ -22,8 +22,8 @@ from sl_common.errors import CalibrationError
 from sl_projector.sequence.stack import Stack
 from sl_reconstruct.model.calibration_file import Calibration
 from sl_reconstruct.model.rig import Device, Rig
-from support.calibration_bench import PITCHES, START, FakeRig, look_with
-from support.calibration_scenes import RIG, Scene
+from support.devices.calibration_bench import PITCHES, START, FakeRig, look_with
+from support.scenes.calibration_scenes import RIG, Scene
 
 HEIGHTS_M = (-0.8e-3, 0.0, 0.8e-3)
 

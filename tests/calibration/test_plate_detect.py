@@ -14,9 +14,9 @@ from sl_calibration.target.hole_detection import find_plate
 from sl_calibration.target.plate import DEFAULT_PLATE, HoleFlag, Plate
 from sl_calibration.target.plate_map import map_circles
 from sl_common.errors import CalibrationError
-from support.bench_scenes import tilt
 from support.paths import DATA
-from support.plate_scenes import PLATE, chamfered, drawn, exposed, pinhole, through
+from support.scenes.bench_scenes import tilt
+from support.scenes.plate_scenes import PLATE, chamfered, drawn, exposed, pinhole, through
 
 #: What the issue asks of a centre on the reference bench.
 LIMIT_PX = 0.02

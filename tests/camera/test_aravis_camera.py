@@ -20,7 +20,7 @@ from sl_camera.camera.camera import CameraDriver, CameraSettings, Frame, FrameSt
 from sl_camera.drivers.aravis_camera import AravisCamera, AravisOptions
 from sl_camera.drivers.aravis_library import list_cameras, load_aravis
 from sl_common.errors import DeviceError, DeviceLost, DeviceRefused
-from support.camera_bench import HEIGHT, SERIAL, WIDTH, fake_gige, gige_bench, require_gi
+from support.devices.camera_bench import HEIGHT, SERIAL, WIDTH, fake_gige, gige_bench, require_gi
 from support.patience import Deadline
 
 EXPOSURE_S = 0.003

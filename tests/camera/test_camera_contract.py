@@ -16,7 +16,7 @@ import pytest
 
 from sl_camera.camera.camera import CameraDriver, CameraSettings, Frame, FrameStatus
 from sl_common.errors import DeviceError, DeviceRefused
-from support.camera_bench import KINDS, Made, real
+from support.devices.camera_bench import KINDS, Made, real
 from support.patience import Deadline
 
 HARDWARE = "camera="

@@ -12,8 +12,8 @@ from sl_bench.stage.grbl_emulator import GrblEmulator
 from sl_camera.stage.grbl.grbl_protocol import is_supported, parse_setting
 from sl_camera.stage.grbl.grbl_stage import GrblStage
 from sl_common.errors import DeviceError, DeviceRefused, DeviceTimeout
+from support.devices.stage_bench import Clock, Mover
 from support.patience import wait
-from support.stage_bench import Clock, Mover
 
 Change = Callable[[bytes, bytes], bytes]
 

@@ -19,8 +19,8 @@ from sl_camera.stage.grbl.grbl_conversation import GrblConversation
 from sl_camera.stage.grbl.grbl_protocol import machine_frame, parse_report
 from sl_camera.stage.grbl.grbl_stage import GrblStage
 from sl_common.errors import DeviceError, DeviceRefused
+from support.devices.stage_bench import Clock, Mover
 from support.patience import wait
-from support.stage_bench import Clock, Mover
 
 Change = Callable[[bytes, bytes], bytes]
 

@@ -17,7 +17,7 @@ from sl_camera.drivers.camera_drivers import make_camera
 from sl_camera.drivers.replay_camera import ReplayCamera
 from sl_camera.drivers.uvc_camera import UvcCamera, UvcOptions
 from sl_common.errors import ConfigError, DeviceError, DeviceLost, DeviceRefused
-from support.camera_bench import HEIGHT, WIDTH, FakeCapture, write_bag
+from support.devices.camera_bench import HEIGHT, WIDTH, FakeCapture, write_bag
 
 SOFTWARE = CameraSettings(exposure_s=0.001, trigger="software")
 

@@ -16,7 +16,7 @@ import pytest
 
 from sl_camera.stage.stage import Position
 from sl_common.errors import DeviceLost, DeviceRefused, DeviceTimeout
-from support.stage_bench import Mover, StageBench, stage_bench
+from support.devices.stage_bench import Mover, StageBench, stage_bench
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

@@ -16,8 +16,8 @@ from sl_camera.stage.manual_stage import ManualStage
 from sl_camera.stage.zaber.zaber_protocol import checksum, command, parse_reply
 from sl_camera.stage.zaber.zaber_stage import ZaberStage, zaber_axes
 from sl_common.errors import ConfigError, DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
+from support.devices.stage_bench import Clock, Mover
 from support.patience import wait
-from support.stage_bench import Clock, Mover
 
 
 class Rig:

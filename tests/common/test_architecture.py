@@ -149,6 +149,16 @@ def test_every_room_is_known_and_holds_few_files(package: str) -> None:
         assert (name / "__init__.py").exists()
 
 
+def test_test_files_are_short_and_their_folders_hold_few() -> None:
+    files = sorted((ROOT / "tests").rglob("*.py"))
+    assert not [f for f in files if len(f.read_text().splitlines()) > MAX_FILE_LINES]
+    folders = {f.parent: len(list(f.parent.glob("*.py"))) for f in files}
+    assert not {f: count for f, count in folders.items() if count > MAX_FOLDER_FILES}
+    # Modules of tests are no packages, so their names must differ.
+    names = [f.name for f in files if f.name.startswith("test_")]
+    assert len(names) == len(set(names))
+
+
 def module(file: Path) -> str:
     parts = file.relative_to(ROOT / "src").with_suffix("").parts[1:]
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)

@@ -23,7 +23,7 @@ from sl_camera.camera_node import CameraNode  # noqa: E402
 from sl_common import topics  # noqa: E402
 from sl_common.errors import DeviceLost  # noqa: E402
 from sl_common.messages import stamp_from_msg, stamp_to_msg  # noqa: E402
-from support.fake_devices import FakeCamera  # noqa: E402
+from support.devices.fake_devices import FakeCamera  # noqa: E402
 from support.patience import wait  # noqa: E402
 from support.tiny_graph import HEIGHT, WIDTH, set_parameters  # noqa: E402
 

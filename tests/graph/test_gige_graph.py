@@ -34,7 +34,7 @@ from sl_common.messages import stamp_from_msg, stamp_to_msg  # noqa: E402
 from sl_projector.dlpc.dlpc900_driver import Dlpc900  # noqa: E402
 from sl_projector.dlpc.dmd import Timing  # noqa: E402
 from sl_projector.sequence.pattern_sequence import named  # noqa: E402
-from support.camera_bench import fake_gige, gige_bench, gvcp_port, require_gi  # noqa: E402
+from support.devices.camera_bench import fake_gige, gige_bench, gvcp_port, require_gi  # noqa: E402
 from support.patience import wait  # noqa: E402
 
 PAPER = named("paper")

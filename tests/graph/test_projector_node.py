@@ -27,11 +27,11 @@ from sl_common import topics  # noqa: E402
 from sl_common.errors import ConfigError, DeviceError  # noqa: E402
 from sl_common.messages import stamp_from_msg  # noqa: E402
 from sl_projector.projector_node import ProjectorNode  # noqa: E402
-from support.fake_devices import FakeProjector  # noqa: E402
+from support.devices.fake_devices import FakeProjector  # noqa: E402
 from support.patience import wait  # noqa: E402
 from support.ros_graph import Graph  # noqa: E402
+from support.scenes.tiny_scans import tiny_sequence  # noqa: E402
 from support.tiny_graph import tiny_projector  # noqa: E402
-from support.tiny_scans import tiny_sequence  # noqa: E402
 
 
 def project(graph: Graph, name: str = "paper", exposure_s: float = 0.004) -> Project.Response:

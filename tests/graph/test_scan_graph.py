@@ -28,11 +28,11 @@ from sl_reconstruct.cloud.cloud_writer import cloud_hash  # noqa: E402
 from sl_reconstruct.messages import cloud_from_msg  # noqa: E402
 from sl_reconstruct.model.calibration_file import rig_hash, save_calibration  # noqa: E402
 from sl_reconstruct.reconstruct_node import ReconstructNode  # noqa: E402
-from support.fake_devices import FakeProjector, FakeStage, WiredPair  # noqa: E402
+from support.devices.fake_devices import FakeProjector, FakeStage, WiredPair  # noqa: E402
 from support.patience import PATIENCE_S, patience, wait  # noqa: E402
 from support.ros_graph import Graph  # noqa: E402
+from support.scenes.tiny_scans import tiny_rig  # noqa: E402
 from support.tiny_graph import assert_plane, calibrated_by, frames, tiny_projector  # noqa: E402
-from support.tiny_scans import tiny_rig  # noqa: E402
 
 
 class Rig:

@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 from sl_camera.stage_node import StageNode  # noqa: E402
 from sl_common import topics  # noqa: E402
 from sl_common.messages import stamp_from_msg  # noqa: E402
-from support.fake_devices import FakeStage  # noqa: E402
+from support.devices.fake_devices import FakeStage  # noqa: E402
 from support.patience import wait  # noqa: E402
 
 

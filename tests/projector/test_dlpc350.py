@@ -25,7 +25,7 @@ from sl_projector.dlpc.dlpc350_flash import flash_layout, write_flash_images
 from sl_projector.dlpc.dmd import Timing, TriggerIn, TriggerOut, dmd_model
 from sl_projector.hid.usb_socket import LinkBackend
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence, named
-from support.dlpc900_bench import Recorder, VirtualClock
+from support.devices.dlpc900_bench import Recorder, VirtualClock
 from support.patience import wait
 
 SIZE = dmd_model("DLP4500").size

@@ -11,7 +11,7 @@ from sl_common.errors import ConfigError, DeviceError, DeviceLost, DeviceTimeout
 from sl_projector.dlpc.dlpc900_driver import Dlpc900Settings
 from sl_projector.dlpc.dmd import Timing, TriggerIn, TriggerOut, dmd_model
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence, named
-from support.dlpc900_bench import FAST, START, Bench, open_bench
+from support.devices.dlpc900_bench import FAST, START, Bench, open_bench
 from support.patience import patience
 
 

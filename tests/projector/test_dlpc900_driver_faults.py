@@ -11,7 +11,7 @@ from sl_common.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeo
 from sl_projector.dlpc.dlpc900_port import Dlpc900Port
 from sl_projector.dlpc.dmd import Timing
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence, named
-from support.dlpc900_bench import FAST, START, Bench, open_bench
+from support.devices.dlpc900_bench import FAST, START, Bench, open_bench
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from sl_projector.dlpc.dlpc900_driver import Dlpc900
 from sl_projector.dlpc.dmd import DEFAULT_MODEL, ProjectorDriver, Timing, dmd_model
 from sl_projector.hid.usb_socket import LinkBackend
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence, named
-from support.dlpc900_bench import Bench
+from support.devices.dlpc900_bench import Bench
 
 TIMING = Timing(2e-3, 500e-6)
 HARDWARE = "dlpc900="

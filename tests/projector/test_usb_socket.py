@@ -14,7 +14,7 @@ from sl_projector.dlpc.dlpc900_driver import Dlpc900
 from sl_projector.dlpc.dmd import Timing
 from sl_projector.hid.usb_transport import open_usb
 from sl_projector.sequence.pattern_sequence import named
-from support.dlpc900_bench import Bench
+from support.devices.dlpc900_bench import Bench
 
 VENDOR, PRODUCT = 0x0451, 0xC900
 

@@ -39,9 +39,9 @@ from sl_projector.hid.usb_socket import LinkBackend
 from sl_projector.projector_node import ProjectorNode
 from sl_projector.sequence.pattern_sequence import named
 from support import ros_graph
+from support.devices.stage_bench import Clock
 from support.patience import Deadline, wait
 from support.ros_graph import Graph
-from support.stage_bench import Clock
 
 PAPER = named("paper")
 PERIOD_S = 0.02

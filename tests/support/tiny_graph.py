@@ -18,9 +18,9 @@ from sl_calibration.calibration_node import CalibrationNode  # noqa: E402
 from sl_common import topics  # noqa: E402
 from sl_projector.projector_node import ProjectorNode  # noqa: E402
 from sl_reconstruct.messages import cloud_from_msg  # noqa: E402
-from support.fake_devices import FakeProjector  # noqa: E402
+from support.devices.fake_devices import FakeProjector  # noqa: E402
 from support.ros_graph import Graph  # noqa: E402
-from support.tiny_scans import HEIGHT_M, SLOPE, render, tiny_sequence  # noqa: E402
+from support.scenes.tiny_scans import HEIGHT_M, SLOPE, render, tiny_sequence  # noqa: E402
 
 SEQUENCE = tiny_sequence("precise")
 PERIOD_NS = 20_000_000

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sl_calibration.data.view_extraction import light_slope
-from support.plate_scenes import PLATE, drawn, pinhole
+from support.scenes.plate_scenes import PLATE, drawn, pinhole
 
 AT_PX = np.stack(np.meshgrid(np.arange(60, 350, 20), np.arange(60, 250, 20)), axis=-1)
 

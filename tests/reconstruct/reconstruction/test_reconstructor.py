@@ -16,7 +16,7 @@ from sl_reconstruct.decode.decode_plan import DecodePlan
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.model.rig import Rig
 from sl_reconstruct.reconstruction.reconstructor import Reconstructor
-from support.stripe_scenes import (
+from support.scenes.stripe_scenes import (
     AMBIENT,
     BLUR_PX,
     E_PER_DN,

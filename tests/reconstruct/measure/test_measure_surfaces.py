@@ -10,8 +10,8 @@ from sl_reconstruct.measure.plane_angle import measure_plane
 from sl_reconstruct.measure.region import Region, Selection, select
 from sl_reconstruct.measure.roughness import areal_parameters, measure_roughness
 from sl_reconstruct.measure.sphere_cylinder import measure_sphere
-from support.measured_clouds import cloud
 from support.paths import DATA
+from support.scenes.measured_clouds import cloud
 
 surfalize = pytest.importorskip("surfalize", reason="pip install surfalize")
 

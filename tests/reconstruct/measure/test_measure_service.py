@@ -27,7 +27,7 @@ from sl_reconstruct.cloud.cloud import CLOUD_DTYPE  # noqa: E402
 from sl_reconstruct.cloud.cloud_writer import save_pcd  # noqa: E402
 from sl_reconstruct.cloud.height_map import make_height_map, save_tiff  # noqa: E402
 from sl_reconstruct.measure_service_node import MeasureService  # noqa: E402
-from support.measured_clouds import cloud  # noqa: E402
+from support.scenes.measured_clouds import cloud  # noqa: E402
 
 SLOPE = 0.2
 ANGLE_DEG = 180.0 - 2.0 * math.degrees(math.atan(SLOPE))

@@ -15,7 +15,7 @@ from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence, nam
 from sl_reconstruct.decode.illumination_check import check_illumination
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.reconstruction.reconstructor import Reconstructor
-from support.stripe_scenes import WHITE_DN, Plane, expose, noiseless, small_rig
+from support.scenes.stripe_scenes import WHITE_DN, Plane, expose, noiseless, small_rig
 
 #: Gray images, all of which can be judged, white where there is one, fine ones with and without
 #: an inverse.

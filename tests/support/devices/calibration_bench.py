@@ -20,7 +20,7 @@ from sl_calibration.workflow.run_record import Pitches
 from sl_common.errors import CalibrationError
 from sl_projector.sequence.pattern_sequence import named
 from sl_projector.sequence.stack import Stack, StagePose
-from support.calibration_scenes import CAMERA, RIG, Scene
+from support.scenes.calibration_scenes import CAMERA, RIG, Scene
 
 HEIGHTS_M = (-1e-3, -0.5e-3, 0.0, 0.5e-3, 1e-3)
 PITCHES = Pitches(RIG.camera.pixel_pitch_m, RIG.projector.pixel_pitch_m)

@@ -12,7 +12,7 @@ from sl_reconstruct.cloud.cloud import Cloud
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.decode.stack_statistics import full_scale_dn, saturation_of
 from sl_reconstruct.reconstruction.reconstructor import Reconstructor
-from support.stripe_scenes import WHITE_DN, Plane, expose, noiseless, small_rig
+from support.scenes.stripe_scenes import WHITE_DN, Plane, expose, noiseless, small_rig
 
 
 @pytest.mark.parametrize("bits", [10, 12, 14, 16])

@@ -18,7 +18,7 @@ from sl_reconstruct.measure.region import Region, select
 from sl_reconstruct.measure.roughness import measure_roughness
 from sl_reconstruct.measure.sphere_cylinder import measure_cylinder, measure_sphere
 from sl_reconstruct.measure.step import measure_step
-from support.measured_clouds import SIGMA_M, cloud
+from support.scenes.measured_clouds import SIGMA_M, cloud
 
 Scores = dict[str, float]
 

@@ -15,8 +15,8 @@ from sl_reconstruct.measure.region import Region, select
 from sl_reconstruct.measure.result import COMMON, Tolerance, inflation, uncertainties
 from sl_reconstruct.measure.sphere_cylinder import measure_cylinder, measure_sphere
 from sl_reconstruct.measure.step import measure_step
-from support.measured_clouds import SIGMA_M, cloud
-from support.uncertainty_scenes import AROUND, SCENES, disc, z_scores
+from support.scenes.measured_clouds import SIGMA_M, cloud
+from support.scenes.uncertainty_scenes import AROUND, SCENES, disc, z_scores
 
 #: Seeds of a scene; fewer where one measurement takes a third of a second. The table of all over
 #: 100 seeds: benchmarks/bench_uncertainty.py.

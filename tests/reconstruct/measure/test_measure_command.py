@@ -16,8 +16,8 @@ from sl_reconstruct.cloud.cloud import CLOUD_DTYPE
 from sl_reconstruct.cloud.cloud_reader import read_cloud
 from sl_reconstruct.cloud.cloud_writer import save_pcd, save_ply
 from sl_reconstruct.cloud.height_map import make_height_map, save_tiff
-from support.measured_clouds import cloud
 from support.png_files import pixels
+from support.scenes.measured_clouds import cloud
 
 
 @pytest.fixture

@@ -1,0 +1,1 @@
+"""Devices for tests: fakes, and the emulators with their drivers."""

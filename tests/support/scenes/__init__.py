@@ -1,0 +1,1 @@
+"""Rigs, parts and images whose truth is known."""
