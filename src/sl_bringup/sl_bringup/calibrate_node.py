@@ -38,6 +38,13 @@ class CalibrateClient(GraphClient):
     def calibrate(self, goal: Calibrate.Goal, patience_s: float) -> Any:
         """Calibrate, and return the action's result; cancelled as by `carry_out`.
 
+        Parameters
+        ----------
+        goal : Calibrate.Goal
+            The request.
+        patience_s : float
+            Longest wait for the result, seconds.
+
         Raises
         ------
         DeviceLost
@@ -49,7 +56,15 @@ class CalibrateClient(GraphClient):
         return self.carry_out(self._action, goal, self._feedback, patience_s)
 
     def verify(self, request: Verify.Request, patience_s: float) -> Any:
-        """Check the calibration in force, and return the service's answer; errors as above."""
+        """Check the calibration in force, and return the service's answer; errors as above.
+
+        Parameters
+        ----------
+        request : Verify.Request
+            The request.
+        patience_s : float
+            Longest wait for the answer, seconds.
+        """
         # A request to a service that is not found yet would be lost.
         self.await_graph(self._verify.service_is_ready, topics.VERIFY, CONNECT_S)
         return self.answer(self._verify.call_async(request), patience_s)

@@ -63,6 +63,13 @@ class GraphClient(GraphNode):
     def answer(self, future: Any, patience_s: float) -> Any:
         """Return what a future holds.
 
+        Parameters
+        ----------
+        future : Future
+            Of a call or a goal.
+        patience_s : float
+            Longest wait, seconds.
+
         Raises
         ------
         DeviceTimeout
@@ -79,6 +86,17 @@ class GraphClient(GraphNode):
 
         When it takes too long, and at an interrupt, it is cancelled and its end waited for:
         nothing goes on in the graph for which nobody waits.
+
+        Parameters
+        ----------
+        action : ActionClient
+            The action.
+        goal : object
+            Its goal.
+        feedback : callable
+            Takes each feedback message.
+        patience_s : float
+            Longest wait for the result, seconds.
 
         Raises
         ------
@@ -105,7 +123,15 @@ class GraphClient(GraphNode):
             self.until(ended.done, CANCEL_S)
 
     def until(self, condition: Callable[[], bool], patience_s: float) -> bool:
-        """Serve the node until a condition holds; whether it does in time."""
+        """Serve the node until a condition holds; whether it does in time.
+
+        Parameters
+        ----------
+        condition : callable
+            Tells whether the wait is over.
+        patience_s : float
+            Longest wait, seconds.
+        """
         end_s = time.monotonic() + patience_s
         while not condition():
             if time.monotonic() > end_s:
@@ -114,7 +140,13 @@ class GraphClient(GraphNode):
         return True
 
     def show(self, line: str, detail: str) -> None:
-        """Tell progress: on a terminal over the line before, in a log only what is new."""
+        """Tell progress: on a terminal over the line before, in a log only what is new.
+
+        Parameters
+        ----------
+        line, detail : str
+            What is being done; how far it is, for a terminal.
+        """
         if sys.stderr.isatty():
             sys.stderr.write(f"\r{line}{detail}      ")
         elif line != self._shown:

@@ -65,7 +65,15 @@ class ReplayNode(GraphNode):
         return self._calibrated
 
     def play(self, messages: Iterator[Raw], rate: float) -> None:
-        """Publish at the times of the recording."""
+        """Publish at the times of the recording.
+
+        Parameters
+        ----------
+        messages : iterator of Raw
+            In order of time.
+        rate : float
+            Speed; 1 is the recording's own.
+        """
         status = StatusLine("replaying")
         begun: tuple[float, int] | None = None
         for message in messages:

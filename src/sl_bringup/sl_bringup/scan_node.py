@@ -61,6 +61,13 @@ class ScanClient(GraphClient):
     def scan(self, goal: Scan.Goal, patience_s: float) -> tuple[Any, PointCloud2 | None]:
         """Scan, and return the action's result and the cloud; else as `carry_out`.
 
+        Parameters
+        ----------
+        goal : Scan.Goal
+            The request.
+        patience_s : float
+            Longest wait for the result, seconds.
+
         Raises
         ------
         DeviceTimeout

@@ -298,7 +298,15 @@ _ANSWERS = (
 
 
 def fill(response: Any, outcome: Outcome) -> Any:
-    """Put an outcome into a service's response or an action's result."""
+    """Put an outcome into a service's response or an action's result.
+
+    Parameters
+    ----------
+    response : object
+        The message that is filled.
+    outcome : Outcome
+        How the run ended.
+    """
     for name in _ANSWERS:
         setattr(response, name, getattr(outcome, name))
     return response

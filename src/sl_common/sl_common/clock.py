@@ -15,7 +15,15 @@ class Clock(Protocol):
         ...
 
     def wait_until(self, deadline_ns: int, interrupt: threading.Event) -> bool:
-        """Wait for a moment; True when ``interrupt`` was set before it."""
+        """Wait for a moment; True when ``interrupt`` was set before it.
+
+        Parameters
+        ----------
+        deadline_ns : int
+            Moment, nanoseconds since the epoch.
+        interrupt : threading.Event
+            Ends the wait early.
+        """
         ...
 
 

@@ -79,7 +79,15 @@ class DeviceLink(Generic[DeviceT]):
         return device
 
     def lost(self, device: DeviceT, error: Exception) -> None:
-        """Say that the device failed; it is closed and opened again. Repeats are harmless."""
+        """Say that the device failed; it is closed and opened again. Repeats are harmless.
+
+        Parameters
+        ----------
+        device : object
+            The device that failed; another one is left alone.
+        error : Exception
+            What it raised.
+        """
         with self._lock:
             if self._device is not device:
                 return

@@ -158,7 +158,15 @@ def read_text(path: Path, error: type[SlError]) -> str:
 
 
 def read_document(path: Path, error: type[SlError]) -> Any:
-    """Return the YAML document in a file; see `parse_document`."""
+    """Return the YAML document in a file; see `parse_document`.
+
+    Parameters
+    ----------
+    path : Path
+        A regular file.
+    error : type
+        What is raised.
+    """
     return parse_document(read_text(path, error), str(path), error)
 
 
@@ -185,7 +193,15 @@ def written_atomically(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file in one step: either the whole text is there or the old file is."""
+    """Write a text file in one step: either the whole text is there or the old file is.
+
+    Parameters
+    ----------
+    path : Path
+        The file; its folder is made.
+    text : str
+        All of its text.
+    """
     with written_atomically(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
@@ -248,7 +264,17 @@ class Fields:
         return key in self._value
 
     def get(self, key: str, read: Callable[[Any, str, type[SlError]], Any], *default: Any) -> Any:
-        """Value of a key, checked by ``read``; the default, or an error when there is none."""
+        """Value of a key, checked by ``read``; the default, or an error when there is none.
+
+        Parameters
+        ----------
+        key : str
+            The key.
+        read : callable
+            Checks and returns its value, as `a_number` does.
+        *default : object
+            Returned when the key is missing.
+        """
         if key in self._value:
             return read(self._value[key], f"{self._where}.{key}", self._error)
         if default:
@@ -266,28 +292,56 @@ def describe(value: Any) -> str:
 
 
 def a_string(value: Any, where: str, error: type[SlError]) -> str:
-    """Check that a value is a non-empty string."""
+    """Check that a value is a non-empty string.
+
+    Parameters
+    ----------
+    value : object
+        What the document has.
+    where : str
+        Its place, for the message.
+    error : type
+        What is raised.
+    """
     if not isinstance(value, str) or not value:
         raise error(f"{where} is {describe(value)}; expected a word")
     return value
 
 
 def a_flag(value: Any, where: str, error: type[SlError]) -> bool:
-    """Check that a value is true or false."""
+    """Check that a value is true or false.
+
+    Parameters
+    ----------
+    value, where, error
+        As in `a_string`.
+    """
     if not isinstance(value, bool):
         raise error(f"{where} is {describe(value)}; expected true or false")
     return value
 
 
 def a_whole_number(value: Any, where: str, error: type[SlError]) -> int:
-    """Check that a value is an integer (not a flag, not 3.0)."""
+    """Check that a value is an integer (not a flag, not 3.0).
+
+    Parameters
+    ----------
+    value, where, error
+        As in `a_string`.
+    """
     if isinstance(value, bool) or not isinstance(value, int):
         raise error(f"{where} is {describe(value)}; expected a whole number")
     return value
 
 
 def a_number(value: Any, where: str, error: type[SlError]) -> float:
-    """Check that a value is a finite number."""
+    """Check that a value is a finite number.
+
+    Parameters
+    ----------
+    value, where, error
+        As in `a_string`.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise error(f"{where} is {describe(value)}; expected a finite number")
     try:
@@ -300,7 +354,13 @@ def a_number(value: Any, where: str, error: type[SlError]) -> float:
 
 
 def a_list(value: Any, where: str, error: type[SlError]) -> list[Any]:
-    """Check that a value is a list."""
+    """Check that a value is a list.
+
+    Parameters
+    ----------
+    value, where, error
+        As in `a_string`.
+    """
     if not isinstance(value, list):
         raise error(f"{where} is {describe(value)}; expected a list")
     return value
@@ -320,7 +380,13 @@ def numbers(*lengths: int) -> Callable[[Any, str, type[SlError]], list[float]]:
 
 
 def a_size(value: Any, where: str, error: type[SlError]) -> tuple[int, int]:
-    """Check that a value is [width, height], two whole numbers of at least 1."""
+    """Check that a value is [width, height], two whole numbers of at least 1.
+
+    Parameters
+    ----------
+    value, where, error
+        As in `a_string`.
+    """
     items = a_list(value, where, error)
     if len(items) != 2:
         raise error(f"{where} has {len(items)} entries; expected [width, height]")

@@ -33,6 +33,13 @@ def ros_message(msgtype: str, **fields: Any) -> Any:
 
     Bytes are not copied: rclpy's setter of ``uint8[]`` copies into an ``array.array`` (0.15 s for
     an image), but its serialisation takes anything with a buffer, so the storage is set directly.
+
+    Parameters
+    ----------
+    msgtype : str
+        ``package/msg/Type``.
+    **fields
+        Its fields; those left out have the type's default.
     """
     message = interface_class(msgtype)()
     for name, value in fields.items():

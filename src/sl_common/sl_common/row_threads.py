@@ -22,6 +22,13 @@ def share_rows(work: Callable[[int, int], None], rows: int) -> None:
 
     Returns when all are done; raises what any of them raised. Rows must not depend on each
     other, then the result does not depend on the number of cores.
+
+    Parameters
+    ----------
+    work : callable
+        Takes the first row of a part and the one behind its last.
+    rows : int
+        Number of rows.
     """
     parts = max(1, min(rows, PARTS * len(os.sched_getaffinity(0))))
     bounds = [rows * i // parts for i in range(parts + 1)]

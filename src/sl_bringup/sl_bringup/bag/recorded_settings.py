@@ -78,9 +78,11 @@ def read_settings(bag: Bag) -> RecordedSettings:
         if len(found) > 1:
             notes.append(f"the {what} changed during the recording; the last ones hold for all")
     return RecordedSettings(
-        tuple(reconstruction), matching[-1] if matching else None, scales[-1] if scales else 0,
+        tuple(reconstruction),
+        matching[-1] if matching else None,
+        scales[-1] if scales else 0,
         tuple(notes),
-    )  # fmt: skip
+    )
 
 
 def _all(

@@ -39,13 +39,20 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--square-mm", required=True, type=float, help="side of a square")
     parser.add_argument("--output", required=True, type=Path, metavar="FILE", help="calibration")
     parser.add_argument(
-        "--coefficients", type=int, choices=(0, 2, 4, 5), default=2,
+        "--coefficients",
+        type=int,
+        choices=(0, 2, 4, 5),
+        default=2,
         help="of each lens: none; k1, k2; with p1, p2; with k3 (default: 2)",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--pitch-um", type=float, nargs=2, default=(5.0, 10.0), metavar=("CAMERA", "DMD"),
+        "--pitch-um",
+        type=float,
+        nargs=2,
+        default=(5.0, 10.0),
+        metavar=("CAMERA", "DMD"),
         help="pixel pitches; they only turn pixels into millimetres in reports (default: 5 10)",
-    )  # fmt: skip
+    )
     parser.add_argument("--namespace", help="namespace of the rig, where the bag has several")
     parser.set_defaults(run=run)
 
@@ -84,8 +91,9 @@ def run(args: argparse.Namespace) -> int:
     save_calibration(args.output, Calibration(pair.rig, None, residuals, made_from))
     for scan, used in zip(names, solution.used, strict=True):
         if not used.all():
-            off = ", ".join(f"({k % args.corners[0]}, {k // args.corners[0]})"
-                            for k in (~used).nonzero()[0])  # fmt: skip
+            off = ", ".join(
+                f"({k % args.corners[0]}, {k // args.corners[0]})" for k in (~used).nonzero()[0]
+            )
             say(f"scan {scan}: left out, off the model: corners (column, row) {off}")
     say(
         f"stereo rms {pair.rms_px:.3f} px ({solution.all_rms_px:.3f} with every corner), camera "

@@ -86,7 +86,15 @@ def add_parser(subparsers: Any) -> None:
 
 
 async def calibrate_once(args: argparse.Namespace, options: GraphOptions) -> int:
-    """Start a graph, calibrate, stop the graph; 0 only when all went well."""
+    """Start a graph, calibrate, stop the graph; 0 only when all went well.
+
+    Parameters
+    ----------
+    args : Namespace
+        The command line.
+    options : GraphOptions
+        Domain, namespace and configuration.
+    """
     log = options.directory / "graph.log"
     with log.open("w") as file:
 
@@ -100,7 +108,15 @@ async def calibrate_once(args: argparse.Namespace, options: GraphOptions) -> int
 
 
 async def calibrate_bench(graph: Graph, options: GraphOptions) -> int:
-    """Put the hole plate on the bench, calibrate, put the configured part back."""
+    """Put the hole plate on the bench, calibrate, put the configured part back.
+
+    Parameters
+    ----------
+    graph : Graph
+        The running graph with its bench.
+    options : GraphOptions
+        Domain, namespace and configuration.
+    """
     # Imported late: hardware does without it.
     from sl_bench.process.bench_control import BenchControl
     from sl_bench.process.bench_settings import read_settings

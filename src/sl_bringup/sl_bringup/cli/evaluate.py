@@ -119,32 +119,49 @@ def add_parser(subparsers: Any) -> None:
         "bags", type=Path, nargs="+", metavar="BAG", help="rosbag2 directory, .mcap or .db3"
     )
     parser.add_argument(
-        "--calibration", type=Path, metavar="FILE",
+        "--calibration",
+        type=Path,
+        metavar="FILE",
         help="use this one (YAML, or OpenCV's XML, YAML, JSON), not the bag's",
-    )  # fmt: skip
+    )
     parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="for the results")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", dest="assignments",
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        dest="assignments",
         help="change a setting of reconstruction or matching; may be repeated",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--sweep", action="append", default=[], metavar="NAME=A,B,C",
+        "--sweep",
+        action="append",
+        default=[],
+        metavar="NAME=A,B,C",
         help="evaluate with each of these values, and compare them in one table; may be repeated",
-    )  # fmt: skip
+    )
     parser.add_argument("--namespace", help="namespace of the rig, where the bag has several")
     parser.add_argument(
-        "--pictures", choices=("none", "first", "all"), default=None,
+        "--pictures",
+        choices=("none", "first", "all"),
+        default=None,
         help="of which scans pictures are drawn; none: no pages either (default: all; with "
         "--sweep: first)",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--no-pictures", action="store_const", const="none", dest="pictures",
+        "--no-pictures",
+        action="store_const",
+        const="none",
+        dest="pictures",
         help="as --pictures none",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--jobs", type=int, default=len(os.sched_getaffinity(0)), metavar="N",
+        "--jobs",
+        type=int,
+        default=len(os.sched_getaffinity(0)),
+        metavar="N",
         help="scans evaluated at a time (default: one per core)",
-    )  # fmt: skip
+    )
     parser.set_defaults(run=run)
 
 

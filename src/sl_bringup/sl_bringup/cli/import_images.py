@@ -238,9 +238,11 @@ def add_parser(subparsers: Any) -> None:
         "--calibration", type=Path, metavar="FILE", help="store this calibration in the bag"
     )
     parser.add_argument(
-        "--dmd-size", type=_dmd_size, metavar="WxH",
+        "--dmd-size",
+        type=_dmd_size,
+        metavar="WxH",
         help="DMD columns x rows of a built-in sequence (default 1024x768)",
-    )  # fmt: skip
+    )
     parser.set_defaults(run=run)
 
 

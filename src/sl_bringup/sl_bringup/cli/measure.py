@@ -73,9 +73,11 @@ def add_parser(subparsers: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "cloud", type=Path, metavar="CLOUD|TIFF",
+        "cloud",
+        type=Path,
+        metavar="CLOUD|TIFF",
         help="cloud.pcd, cloud.ply, or height.tiff with its report.json",
-    )  # fmt: skip
+    )
     for name, feature in FEATURES.items():
         if feature.metavar:
             parser.add_argument(
@@ -84,28 +86,35 @@ def add_parser(subparsers: Any) -> None:
         else:
             parser.add_argument(f"--{name}", action="store_const", const=(), help=feature.help)
     parser.add_argument(
-        "--reference", type=Path, metavar="TIFF",
+        "--reference",
+        type=Path,
+        metavar="TIFF",
         help="compare with this height map (report.json beside it)",
-    )  # fmt: skip
+    )
     parser.add_argument(
         "--level", action="store_true", help="take offset and tilt out of the comparison"
     )
     parser.add_argument(
-        "--tolerance", type=tolerance_of, metavar="LOW:HIGH",
+        "--tolerance",
+        type=tolerance_of,
+        metavar="LOW:HIGH",
         help="limits of the value, in the unit in which it is told; one measurement only",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--quantity", metavar="NAME",
+        "--quantity",
+        metavar="NAME",
         help="what the tolerance is for, as --json names it: Sa, centre_x, a, ... (default: the "
         "value); lengths in mm of sphere, cylinder and hole, else in µm",
-    )  # fmt: skip
+    )
     parser.add_argument(
         "--region", type=numbers_of, metavar=RECTANGLE, help="where to compare (default: all over)"
     )
     parser.add_argument(
-        "--picture", type=Path, metavar="PNG",
+        "--picture",
+        type=Path,
+        metavar="PNG",
         help="draw the section with its uncertainty, or the map of deviations",
-    )  # fmt: skip
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all results")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the section's points")
     parser.add_argument("--x3p", type=Path, metavar="FILE", help="write the height map as X3P")
@@ -213,9 +222,17 @@ def _verdict(found: Measurement, tolerance: Tolerance | None, name: str | None) 
 def lines(found: Measurement) -> Iterator[str]:
     """Lines that tell a person what was measured."""
     factor, unit = told(found)
-    names = {"plane": "flatness", "deviation": "mean deviation", "roughness": "Sq",
-             "angle": "included angle", "hole": "diameter", "profile": "height of section",
-             "sphere": "radius", "cylinder": "radius", "step": "step height"}  # fmt: skip
+    names = {
+        "plane": "flatness",
+        "deviation": "mean deviation",
+        "roughness": "Sq",
+        "angle": "included angle",
+        "hole": "diameter",
+        "profile": "height of section",
+        "sphere": "radius",
+        "cylinder": "radius",
+        "step": "step height",
+    }
     yield (
         f"{names[found.kind]:<18}{rounded(factor * found.value, factor * found.uncertainty)} "
         f"{unit} (standard uncertainty)"
@@ -262,6 +279,7 @@ def _details(found: Measurement) -> Iterator[str]:
 def _plain(content: Mapping[str, Any]) -> dict[str, Any]:
     """Leave maps of whole clouds out of what goes to JSON."""
     return {
-        key: value for key, value in content.items()
+        key: value
+        for key, value in content.items()
         if not (isinstance(value, np.ndarray) and value.ndim > 1)
-    }  # fmt: skip
+    }

@@ -105,9 +105,11 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for them")
     parser.add_argument(
-        "--dmd-size", type=dmd_size, metavar="WxH",
+        "--dmd-size",
+        type=dmd_size,
+        metavar="WxH",
         help="DMD columns x rows of a built-in sequence (default 1024x768)",
-    )  # fmt: skip
+    )
     parser.set_defaults(run=run)
 
 

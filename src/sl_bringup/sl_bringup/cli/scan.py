@@ -51,20 +51,32 @@ def add_parser(subparsers: Any) -> None:
         "--up", action="store_true", help="start the graph for this scan where none is running"
     )
     parser.add_argument(
-        "--calibrate", action="store_true",
+        "--calibrate",
+        action="store_true",
         help="with --up --bench: begin with an unknown rig and calibrate it on the hole plate",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--ready-timeout", type=float, default=240.0, metavar="S",
+        "--ready-timeout",
+        type=float,
+        default=240.0,
+        metavar="S",
         help="with --up: for the graph to get ready, compiling apart (default: 240)",
-    )  # fmt: skip
+    )
     parser.add_argument("--verbose", action="store_true", help="with --up: show the graph's log")
     add_graph_arguments(parser)
     parser.set_defaults(run=run)
 
 
 async def scan_once(args: argparse.Namespace, options: GraphOptions) -> int:
-    """Start a graph, calibrate where it is to, scan, stop it; 0 only when all went well."""
+    """Start a graph, calibrate where it is to, scan, stop it; 0 only when all went well.
+
+    Parameters
+    ----------
+    args : Namespace
+        The command line.
+    options : GraphOptions
+        Domain, namespace and configuration.
+    """
     log: Path = args.output / "graph.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("w") as file:

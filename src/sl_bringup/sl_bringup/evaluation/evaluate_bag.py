@@ -259,9 +259,8 @@ class _BagRun:
         return product.cloud
 
     def _write(
-        self, folder: Path, report: Report, cloud: Cloud | None, stack: Stack | None,
-        first: bool,
-    ) -> None:  # fmt: skip
+        self, folder: Path, report: Report, cloud: Cloud | None, stack: Stack | None, first: bool
+    ) -> None:
         pictures = self._choices.pictures
         wanted = pictures == "all" or (pictures == "first" and first)
         drawn = write_scan(folder, report, cloud, wanted, stack.images if stack else None)

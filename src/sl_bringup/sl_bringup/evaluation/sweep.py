@@ -21,8 +21,16 @@ MAD = 1.4826
 #: More would be a mistake: each is a whole evaluation.
 MAX_VARIANTS = 64
 PICTURES = ("picture_residual.png", "picture_refusals.png")
-COLUMNS = ("scans", "good", "points", "of the lit", "sigma of z", "noise / bound", "plane rms",
-           "z off first")  # fmt: skip
+COLUMNS = (
+    "scans",
+    "good",
+    "points",
+    "of the lit",
+    "sigma of z",
+    "noise / bound",
+    "plane rms",
+    "z off first",
+)
 _TEMPLATE = Path(__file__).parent / "templates" / "sweep.html"
 
 

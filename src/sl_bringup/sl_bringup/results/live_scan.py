@@ -118,8 +118,9 @@ def _cloud(
         reason = np.where(there, Reason.PRESENT, Reason.UNLIT).astype(np.uint8)
     nothing = np.full(points.shape, np.nan, np.float32)
     refused = dict(report["refused"])
-    return Cloud(points.astype(CLOUD_DTYPE, copy=False), nothing, reason, refused,
-                 report["lit_positions"])  # fmt: skip
+    return Cloud(
+        points.astype(CLOUD_DTYPE, copy=False), nothing, reason, refused, report["lit_positions"]
+    )
 
 
 def _groove(found: AngleMeasurement | None) -> dict[str, Any]:

@@ -21,8 +21,14 @@ Drawn = dict[str, tuple[str, bytes]]
 #: Points that a plane is fitted to, about; more change nothing.
 PLANE_POINTS = 100_000
 FILES = ("cloud.ply", "cloud.pcd", "height.tiff", "height.png", "report.json", "report.html")
-PICTURES = ("picture_height", "picture_relief", "picture_residual", "picture_profile",
-            "picture_refusals", "picture_contrast")  # fmt: skip
+PICTURES = (
+    "picture_height",
+    "picture_relief",
+    "picture_residual",
+    "picture_profile",
+    "picture_refusals",
+    "picture_contrast",
+)
 
 
 def write_scan(

@@ -28,9 +28,13 @@ def write_page(path: Path, report: Mapping[str, Any], pictures: Mapping[str, byt
     live = report["bag"] == "live"
     title = f"Scan {report['scan_id']}" + (", live" if live else f" of {report['bag']}")
     page = render_page(
-        _TEMPLATE, title=title, report=report, banner=banner(report), pictures=pictures,
+        _TEMPLATE,
+        title=title,
+        report=report,
+        banner=banner(report),
+        pictures=pictures,
         angle=included_angle(report),
-    )  # fmt: skip
+    )
     write_text(path, page)
 
 

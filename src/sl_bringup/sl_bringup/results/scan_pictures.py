@@ -30,9 +30,16 @@ ENLARGE_ABOVE_ROWS = 400
 ENLARGE_BELOW = 0.03
 #: Distinguishable for colour-blind readers (Okabe and Ito, 2008); grey is "not lit".
 REASON_COLOURS = (
-    "#E69F00", "#56B4E9", "#D55E00", "#CC79A7", "#0072B2", "#F0E442", "#7A4FA3", "#8C510A",
+    "#E69F00",
+    "#56B4E9",
+    "#D55E00",
+    "#CC79A7",
+    "#0072B2",
+    "#F0E442",
+    "#7A4FA3",
+    "#8C510A",
     "#000000",
-)  # fmt: skip
+)
 PRESENT_COLOUR = "#CFE8CF"
 SATURATED_COLOUR = "#FF0000"
 
@@ -117,9 +124,14 @@ def profile_picture(points: NDArray[Any], title: str) -> bytes:
     figure = Figure(figsize=(9, 6), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     above.fill_between(
-        x_mm, (z_m - 2 * sigma_m) * factor, (z_m + 2 * sigma_m) * factor,
-        color="#56B4E9", alpha=0.6, linewidth=0, label="± 2 sigma (stated)",
-    )  # fmt: skip
+        x_mm,
+        (z_m - 2 * sigma_m) * factor,
+        (z_m + 2 * sigma_m) * factor,
+        color="#56B4E9",
+        alpha=0.6,
+        linewidth=0,
+        label="± 2 sigma (stated)",
+    )
     above.plot(x_mm, z_m * factor, color="#0072B2", linewidth=0.8, label="measured")
     above.set(ylabel=f"height z / {unit}", title=f"{title}\nsection along camera row {row}")
     # Outside: "best" knows nothing of lines with gaps, and lay over one.
@@ -146,8 +158,15 @@ def section_picture(sections: Sequence[tuple[str, ProfileMeasurement]], title: s
     figure.suptitle(title)
     for (name, s), part in zip(sections, axes, strict=True):
         x_mm, z_um, u_um = broken_at_gaps(1e3 * s.along_m, 1e6 * s.z_m, 1e6 * s.u_z_m)
-        part.fill_between(x_mm, z_um - 2 * u_um, z_um + 2 * u_um, color="#56B4E9", alpha=0.6,
-                          linewidth=0, label="± 2 standard uncertainties")  # fmt: skip
+        part.fill_between(
+            x_mm,
+            z_um - 2 * u_um,
+            z_um + 2 * u_um,
+            color="#56B4E9",
+            alpha=0.6,
+            linewidth=0,
+            label="± 2 standard uncertainties",
+        )
         part.plot(x_mm, z_um, color="#0072B2", linewidth=0.8, label=name)
         part.set_ylabel("z / µm")
         part.grid(True, alpha=0.3)
@@ -177,9 +196,13 @@ def refusal_picture(
     figure = Figure(figsize=(9, 6), layout="constrained")
     axes = figure.subplots()
     axes.imshow(
-        _enlarged(reasons), cmap=colours, vmin=-0.5, vmax=len(palette) + 1.5, aspect="auto",
+        _enlarged(reasons),
+        cmap=colours,
+        vmin=-0.5,
+        vmax=len(palette) + 1.5,
+        aspect="auto",
         interpolation="nearest",
-    )  # fmt: skip
+    )
     axes.set(xlabel="DMD column boundary", ylabel="camera row", title=title)
     entries = [
         ("points", PRESENT_COLOUR),
@@ -251,9 +274,12 @@ def _map(
     figure, axes = _map_axes(height, title + missing)
     axes.set_facecolor(MISSING_COLOUR)
     image = axes.imshow(
-        values_m * factor, cmap=colours, vmin=low * factor, vmax=high * factor,
+        values_m * factor,
+        cmap=colours,
+        vmin=low * factor,
+        vmax=high * factor,
         extent=_extent_mm(height),
-    )  # fmt: skip
+    )
     bar = figure.colorbar(image, ax=axes, extend="both", shrink=0.9)
     bar.set_label(f"{label} / {unit}")
     return png(figure)

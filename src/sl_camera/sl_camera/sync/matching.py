@@ -70,7 +70,15 @@ class StackMatcher:
     # -- what comes in ----------------------------------------------------------------------
 
     def trigger(self, event: TriggerEvent, now_ns: int) -> list[FrameDecision]:
-        """Take a trigger; it may explain images that came before it."""
+        """Take a trigger; it may explain images that came before it.
+
+        Parameters
+        ----------
+        event : TriggerEvent
+            What was announced.
+        now_ns : int
+            Monotonic clock, nanoseconds.
+        """
         return [
             *self._advance(now_ns),
             *self._take_trigger(event, now_ns),
@@ -79,7 +87,15 @@ class StackMatcher:
         ]
 
     def image(self, event: ImageEvent, now_ns: int) -> list[FrameDecision]:
-        """Take an image; its pixels are copied once, here or when its trigger comes."""
+        """Take an image; its pixels are copied once, here or when its trigger comes.
+
+        Parameters
+        ----------
+        event : ImageEvent
+            What arrived.
+        now_ns : int
+            Monotonic clock, nanoseconds.
+        """
         decisions = list(self._advance(now_ns))
         self._arrivals += 1
         waiting = _Waiting(event, self._arrivals, now_ns)
@@ -93,7 +109,15 @@ class StackMatcher:
         return [*decisions, *self._advance(now_ns)]
 
     def pose(self, event: StagePose, now_ns: int) -> list[FrameDecision]:
-        """Take a pose; the first one after a scan's last exposure may complete it."""
+        """Take a pose; the first one after a scan's last exposure may complete it.
+
+        Parameters
+        ----------
+        event : StagePose
+            What the stage said.
+        now_ns : int
+            Monotonic clock, nanoseconds.
+        """
         decisions = list(self._advance(now_ns))
         self._poses.add(event)
         return [*decisions, *self._advance(now_ns)]

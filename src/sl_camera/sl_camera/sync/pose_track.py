@@ -40,7 +40,13 @@ class PoseTrack:
         return bool(self._stamps) and self._stamps[-1] >= end_ns
 
     def during(self, start_ns: int, end_ns: int) -> list[StagePose]:
-        """Poses from the last at or before the start to the first at or after the end."""
+        """Poses from the last at or before the start to the first at or after the end.
+
+        Parameters
+        ----------
+        start_ns, end_ns : int
+            Stamps, nanoseconds.
+        """
         first = max(bisect_right(self._stamps, start_ns) - 1, 0)
         last = bisect_left(self._stamps, end_ns)
         return self._poses[first : last + 1]
@@ -49,6 +55,11 @@ class PoseTrack:
         """Where the part stood from start to end, and why that cannot be said (or "").
 
         Without `require_pose` the poses may be missing; those that are there must agree.
+
+        Parameters
+        ----------
+        start_ns, end_ns : int
+            First exposure's start and last one's end, nanoseconds.
         """
         poses = self.during(start_ns, end_ns)
         fault = next((f for f in (p.fault() for p in poses) if f), "")

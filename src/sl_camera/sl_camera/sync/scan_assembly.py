@@ -64,7 +64,15 @@ class ScanRecord:
     # -- triggers ---------------------------------------------------------------------------
 
     def add_trigger(self, event: TriggerEvent, now_ns: int) -> FrameDecision | None:
-        """Take a trigger of this scan; the decision tells of a fault, None of none."""
+        """Take a trigger of this scan; the decision tells of a fault, None of none.
+
+        Parameters
+        ----------
+        event : TriggerEvent
+            What was announced.
+        now_ns : int
+            Monotonic clock, nanoseconds.
+        """
         fault, status = self._trigger_fault(event), Status.REORDERED
         if not fault and event.index in self.triggers:
             fault, status = f"trigger {self.of(event.index)} came twice", Status.DUPLICATE
@@ -173,6 +181,15 @@ class ScanRecord:
 
         The status is that of the image; MATCHED with a reason is an image that is right itself but
         shows that another one is missing.
+
+        Parameters
+        ----------
+        event : ImageEvent
+            What arrived.
+        index, arrival : int
+            Number of its trigger; how many images came before it.
+        now_ns : int
+            Monotonic clock, nanoseconds.
         """
         if self.first_arrival < 0:
             self.first_arrival = arrival
@@ -301,7 +318,21 @@ class ScanRecord:
         image_ns: int = 0,
         pose: StagePose | None = None,
     ) -> FrameDecision:
-        """Make a decision of this scan; the trigger's stamp is looked up where not given."""
+        """Make a decision of this scan; the trigger's stamp is looked up where not given.
+
+        Parameters
+        ----------
+        status : Status
+            The verdict.
+        index : int
+            Number of the pattern.
+        reason : str
+            Why, in words.
+        trigger_ns, image_ns : int
+            Stamps, nanoseconds; 0 for none.
+        pose : StagePose, optional
+            Where the part stood.
+        """
         if trigger_ns is None:
             trigger_ns = self.triggers[index].stamp_ns if index in self.triggers else 0
         count = min(self.count, 0xFFFF)

@@ -29,7 +29,13 @@ MAX_DMD_SIDE_PX = 8192
 
 
 def gray_bits(size_px: int, division_px: int) -> int:
-    """Number of Gray bits that tell all divisions of an axis apart (at least one)."""
+    """Number of Gray bits that tell all divisions of an axis apart (at least one).
+
+    Parameters
+    ----------
+    size_px, division_px : int
+        Size of the axis and of a division, DMD pixels.
+    """
     return max(1, math.ceil(math.log2(math.ceil(size_px / division_px))))
 
 
@@ -181,6 +187,13 @@ def paper(dmd_size: tuple[int, int] = DEFAULT_DMD_SIZE, rows: bool = False) -> P
     Divisions are 4 DMD columns wide whatever the DMD's size, so the number of Gray bits grows
     with it (8 for 1024 columns). Edges and centres of the last four patterns together are all
     column boundaries from 4 on. With ``rows`` the same follows for the rows.
+
+    Parameters
+    ----------
+    dmd_size : tuple of int
+        Columns and rows of the DMD.
+    rows : bool
+        Row patterns as well.
     """
     patterns = _paper_axis("column", dmd_size[0])
     if rows:
@@ -193,6 +206,13 @@ def precise(dmd_size: tuple[int, int] = DEFAULT_DMD_SIZE, rows: bool = False) ->
 
     The finest Gray bit is shown at all eight shifts of a stripe, each with its inverse, so every
     column boundary is an edge where pattern and inverse cross, whatever the albedo.
+
+    Parameters
+    ----------
+    dmd_size : tuple of int
+        Columns and rows of the DMD.
+    rows : bool
+        Row patterns as well.
     """
     patterns = [Pattern("white"), Pattern("black"), *_precise_axis("column", dmd_size[0])]
     if rows:
@@ -210,6 +230,13 @@ NAMED = {
 
 def named(name: str, dmd_size: tuple[int, int] = DEFAULT_DMD_SIZE) -> PatternSequence:
     """Return a built-in sequence by name.
+
+    Parameters
+    ----------
+    name : str
+        ``precise``, ``paper``, ``precise-rows`` or ``paper-rows``.
+    dmd_size : tuple of int
+        Columns and rows of the DMD.
 
     Raises
     ------

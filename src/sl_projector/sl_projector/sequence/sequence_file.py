@@ -294,5 +294,15 @@ def _entry(pattern: Pattern) -> FlowMapping:
 def save_sequence(
     path: str | Path, sequence: PatternSequence, files: Sequence[str] | None = None
 ) -> None:
-    """Write a sequence file; see `dump_sequence`."""
+    """Write a sequence file; see `dump_sequence`.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    sequence : PatternSequence
+        What it describes.
+    files : sequence of str, optional
+        Image files, one for each pattern.
+    """
     write_text(Path(path), dump_sequence(sequence, files))

@@ -38,8 +38,13 @@ def read_cloud(path: str | Path) -> NDArray[Any]:
         When the file is missing, damaged or of another kind.
     """
     path = Path(path)
-    readers = {".pcd": _read_pcd, ".ply": _read_ply, ".tif": _read_map, ".tiff": _read_map,
-               ".npy": _read_npy}  # fmt: skip
+    readers = {
+        ".pcd": _read_pcd,
+        ".ply": _read_ply,
+        ".tif": _read_map,
+        ".tiff": _read_map,
+        ".npy": _read_npy,
+    }
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise ConfigError(f"{path} is no cloud; expected one of {', '.join(readers)}")

@@ -47,9 +47,11 @@ class HeightMap:
         """(left, right, bottom, top) of the outermost nodes, metres."""
         rows, columns = self.z_m.shape
         return (
-            self.x0_m, self.x0_m + (columns - 1) * self.step_m,
-            self.y0_m - (rows - 1) * self.step_m, self.y0_m,
-        )  # fmt: skip
+            self.x0_m,
+            self.x0_m + (columns - 1) * self.step_m,
+            self.y0_m - (rows - 1) * self.step_m,
+            self.y0_m,
+        )
 
 
 def typical_spacing_m(points: NDArray[Any]) -> float:

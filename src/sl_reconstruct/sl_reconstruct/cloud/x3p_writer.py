@@ -45,37 +45,48 @@ def save_x3p(path: str | Path, height: HeightMap, made: datetime | None = None) 
 def _main_xml(height: HeightMap, checksum: str, made: datetime) -> bytes:
     """Records 1 (axes), 2 (origin), 3 (data) and 4 (checksum) of clause 5 of the standard."""
     root = ElementTree.Element("p:ISO5436_2", {"xmlns:p": NAMESPACE})
-    _add(root, {
-        "Record1": {
-            "Revision": "ISO5436 - 2000",
-            "FeatureType": "SUR",
-            "Axes": {
-                "CX": _axis("I", "D", height.step_m, height.extent_m[0]),
-                "CY": _axis("I", "D", height.step_m, height.extent_m[2]),
-                "CZ": _axis("A", "F", 1.0, 0.0),
+    _add(
+        root,
+        {
+            "Record1": {
+                "Revision": "ISO5436 - 2000",
+                "FeatureType": "SUR",
+                "Axes": {
+                    "CX": _axis("I", "D", height.step_m, height.extent_m[0]),
+                    "CY": _axis("I", "D", height.step_m, height.extent_m[2]),
+                    "CZ": _axis("A", "F", 1.0, 0.0),
+                },
             },
-        },
-        "Record2": {
-            "Date": made.isoformat(),
-            "Instrument": dict.fromkeys(("Manufacturer", "Model", "Serial", "Version"), UNKNOWN),
-            "CalibrationDate": made.isoformat(),
-            "ProbingSystem": {"Type": "NonContacting", "Identification": "structured light"},
-            "Comment": "slrig; CalibrationDate is not known and the same as Date",
-        },
-        "Record3": {
-            "MatrixDimension": {
-                "SizeX": height.z_m.shape[1], "SizeY": height.z_m.shape[0], "SizeZ": 1,
+            "Record2": {
+                "Date": made.isoformat(),
+                "Instrument": dict.fromkeys(
+                    ("Manufacturer", "Model", "Serial", "Version"), UNKNOWN
+                ),
+                "CalibrationDate": made.isoformat(),
+                "ProbingSystem": {"Type": "NonContacting", "Identification": "structured light"},
+                "Comment": "slrig; CalibrationDate is not known and the same as Date",
             },
-            "DataLink": {"PointDataLink": DATA, "MD5ChecksumPointData": checksum.upper()},
+            "Record3": {
+                "MatrixDimension": {
+                    "SizeX": height.z_m.shape[1],
+                    "SizeY": height.z_m.shape[0],
+                    "SizeZ": 1,
+                },
+                "DataLink": {"PointDataLink": DATA, "MD5ChecksumPointData": checksum.upper()},
+            },
+            "Record4": {"ChecksumFile": CHECKSUM},
         },
-        "Record4": {"ChecksumFile": CHECKSUM},
-    })  # fmt: skip
+    )
     return bytes(ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True))
 
 
 def _axis(kind: str, dtype: str, increment: float, offset: float) -> dict[str, object]:
-    return {"AxisType": kind, "DataType": dtype, "Increment": repr(float(increment)),
-            "Offset": repr(float(offset))}  # fmt: skip
+    return {
+        "AxisType": kind,
+        "DataType": dtype,
+        "Increment": repr(float(increment)),
+        "Offset": repr(float(offset)),
+    }
 
 
 def _add(parent: ElementTree.Element, content: dict[str, object]) -> None:

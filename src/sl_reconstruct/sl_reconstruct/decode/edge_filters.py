@@ -20,7 +20,15 @@ Array = NDArray[np.float64]
 
 
 def gaussian_taps(sd_px: float, radius_px: int) -> Array:
-    """Half of a sampled Gaussian of unit sum, shape (1 + radius,)."""
+    """Half of a sampled Gaussian of unit sum, shape (1 + radius,).
+
+    Parameters
+    ----------
+    sd_px : float
+        Standard deviation, pixels.
+    radius_px : int
+        Where it is cut off, pixels.
+    """
     taps = np.exp(-0.5 * (np.arange(radius_px + 1) / sd_px) ** 2)
     return np.asarray(taps / (taps[0] + 2 * taps[1:].sum()))
 
@@ -38,14 +46,26 @@ def cubic_weights(phase: float) -> Array:
 
 
 def stripe_slope(width_px: float, blur_px: float) -> float:
-    """Slope at the edges of stripes of unit height, ``width_px`` wide, blurred, per pixel."""
+    """Slope at the edges of stripes of unit height, ``width_px`` wide, blurred, per pixel.
+
+    Parameters
+    ----------
+    width_px, blur_px : float
+        Width of a stripe, and the blur's standard deviation, pixels.
+    """
     j = np.arange(-40, 41)
     terms = (-1.0) ** np.abs(j) * np.exp(-0.5 * (j * width_px / blur_px) ** 2)
     return float(terms.sum() / (SQRT_2PI * blur_px))
 
 
 def bar_slope(width_px: float, blur_px: float) -> float:
-    """Slope of BR8, Eq. (6), at the centre of a stripe of unit height, per pixel."""
+    """Slope of BR8, Eq. (6), at the centre of a stripe of unit height, per pixel.
+
+    Parameters
+    ----------
+    width_px, blur_px : float
+        Width of a stripe, and the blur's standard deviation, pixels.
+    """
     j = np.arange(1, 5)
     edge = np.exp(-0.5 * ((width_px / 2 - j) / blur_px) ** 2) / (SQRT_2PI * blur_px)
     return float(2 * edge.sum())
@@ -55,6 +75,13 @@ def noise_gain(taps: Array, blur_px: float) -> Array:
     """Sum of squared weights on the raw signal at each sub-pixel phase, shape (PHASES + 1, 2).
 
     The second column weights with the squared profile of a unit blurred step.
+
+    Parameters
+    ----------
+    taps : ndarray, (1 + radius,)
+        Half of the symmetric filter.
+    blur_px : float
+        Standard deviation of the edge's blur, pixels.
     """
     radius = taps.size - 1
     phases = np.linspace(0, 1, PHASES + 1)

@@ -226,7 +226,17 @@ def gather(p: PixelRow, r: SourceRow, first: int, n: int, t: Tuning) -> None:
 
 @kernel(forceinline=True)
 def gather_pair(pattern: Pixels, inverse: Pixels, r: SourceRow, first: int, n: int) -> None:
-    """Put P + N at the crossings of a pair into the tile; parameters as in `gather`."""
+    """Put P + N at the crossings of a pair into the tile; parameters as in `gather`.
+
+    Parameters
+    ----------
+    pattern, inverse : ndarray, (W,)
+        Row of the pattern and of its inverse, DN.
+    r : SourceRow
+        Crossings of the row; its tile is filled.
+    first, n : int
+        First crossing of the tile, and their number.
+    """
     at, tile = r.at[first : first + n], r.tile
     for i in range(n):
         x = np.uint64(at[i])
@@ -235,7 +245,17 @@ def gather_pair(pattern: Pixels, inverse: Pixels, r: SourceRow, first: int, n: i
 
 @kernel(forceinline=True)
 def gather_single(p: PixelRow, r: SourceRow, first: int, n: int) -> None:
-    """Put a single image's threshold and its numbers of samples into the tile, as `gather`."""
+    """Put a single image's threshold and its numbers of samples into the tile, as `gather`.
+
+    Parameters
+    ----------
+    p : PixelRow
+        Threshold and samples of each pixel.
+    r : SourceRow
+        Crossings of the row; its tile is filled.
+    first, n : int
+        First crossing of the tile, and their number.
+    """
     at, tile = r.at[first : first + n], r.tile
     threshold, bright, dark = p.threshold, p.bright, p.dark
     shift = count_shift(bright.itemsize)
@@ -251,6 +271,13 @@ def find_zeros(tile: Floats, n: int) -> None:
 
     A secant between the two middle samples, and one Newton step: the filtered signal is nearly
     straight, and 1e-5 px are left. Where the cubic has no zero there, the fraction leaves [0, 1].
+
+    Parameters
+    ----------
+    tile : ndarray
+        Filled by `gather`; the zeros are written into it.
+    n : int
+        Number of crossings.
     """
     half, third, sixth = np.float32(1 / 2), np.float32(1 / 3), np.float32(1 / 6)
     two, three = np.float32(2), np.float32(3)
@@ -268,7 +295,17 @@ def find_zeros(tile: Floats, n: int) -> None:
 
 @kernel()
 def refuse_dim_edges(tile: Floats, n: int, t: Tuning) -> None:
-    """Write for each of n crossings why the light under it does not do, or 0."""
+    """Write for each of n crossings why the light under it does not do, or 0.
+
+    Parameters
+    ----------
+    tile : ndarray
+        Filled by `gather`; the reasons are written into it.
+    n : int
+        Number of crossings.
+    t : Tuning
+        Least light and saturation.
+    """
     contrast, saturation, shadow = np.float32(CONTRAST), np.float32(SATURATION), np.float32(SHADOW)
     none = np.float32(0)
     for i in range(n):
@@ -330,7 +367,17 @@ def identify(tile: Floats, n: int, rising_px: int, half: int, flip: bool, t: Tun
 
 @kernel(forceinline=True)
 def look_up_gain(tile: Floats, n: int, gain: Floats) -> None:
-    """Noise gain, (PHASES + 1, 2), of the estimator at the sub-pixel phase of n crossings."""
+    """Noise gain, (PHASES + 1, 2), of the estimator at the sub-pixel phase of n crossings.
+
+    Parameters
+    ----------
+    tile : ndarray
+        Has the zeros; the gains are written into it.
+    n : int
+        Number of crossings.
+    gain : ndarray, (PHASES + 1, 2)
+        From `edge_filters.noise_gain`.
+    """
     phases, half, none = np.float32(PHASES), np.float32(0.5), np.float32(0)
     for i in range(n):
         phase = np.floor(tile[FRACTION + i] * phases + half)

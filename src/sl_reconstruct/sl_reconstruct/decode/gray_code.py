@@ -72,7 +72,15 @@ class PixelRow(NamedTuple):
 
 
 def pixel_row(width: int, dtype: DTypeLike) -> PixelRow:
-    """Return scratch for rows of ``width`` pixels of a stack of type ``dtype``."""
+    """Return scratch for rows of ``width`` pixels of a stack of type ``dtype``.
+
+    Parameters
+    ----------
+    width : int
+        Pixels of a row.
+    dtype : dtype
+        Of the images.
+    """
     sums = np.uint16 if dtype == np.uint8 else np.uint32
     bright, dark = np.zeros((2, width), sums)
     words = np.zeros((width + 7) // 8, np.uint64)
@@ -132,7 +140,19 @@ def set_levels(stack: Pixels, y: int, plan: Layout, p: PixelRow) -> None:
 
 @kernel()
 def set_code(stack: Pixels, y: int, plan: Layout, p: PixelRow) -> None:
-    """Fill ``code``, the Gray code read as a binary number; parameters as in `set_levels`."""
+    """Fill ``code``, the Gray code read as a binary number; parameters as in `set_levels`.
+
+    Parameters
+    ----------
+    stack : ndarray, (N, H, W)
+        Images, DN.
+    y : int
+        The row.
+    plan : Layout
+        Which image carries which bit.
+    p : PixelRow
+        Filled.
+    """
     bits, parity, code = plan.bits, p.parity, p.code
     for x in range(code.size):
         parity[x] = 0

@@ -27,7 +27,15 @@ Array = NDArray[np.float64]
 
 
 def saturation_of(stack: Pixels, settings: Settings) -> int:
-    """Value from which on pixels of a stack are saturated: as chosen, else its full scale."""
+    """Value from which on pixels of a stack are saturated: as chosen, else its full scale.
+
+    Parameters
+    ----------
+    stack : ndarray, (N, H, W)
+        Images, DN.
+    settings : Settings
+        May name the value.
+    """
     return settings.saturation_dn or full_scale_dn(stack)
 
 

@@ -82,7 +82,13 @@ class Lines(NamedTuple):
     tally: NDArray[np.int32]
 
     def part(self, first: int, last: int) -> Lines:
-        """Rows ``first:last``, as views."""
+        """Rows ``first:last``, as views.
+
+        Parameters
+        ----------
+        first, last : int
+            First row, and the one behind the last.
+        """
         return Lines(
             self.u_px[first:last],
             self.sigma_px[first:last],
@@ -95,7 +101,15 @@ class Lines(NamedTuple):
 
 @kernel(forceinline=True)
 def line_at(lines: Lines, row: int) -> Lines:
-    """One of the rows, as views."""
+    """One of the rows, as views.
+
+    Parameters
+    ----------
+    lines : Lines
+        All rows.
+    row : int
+        The one wanted.
+    """
     return Lines(
         lines.u_px[row],
         lines.sigma_px[row],

@@ -332,8 +332,10 @@ def choose(heights: Array, noise: Array) -> Estimate:
 
 def _polynomials(shape: tuple[int, ...]) -> Array:
     """Orthonormal columns (points, terms): polynomials up to a degree of all axes together."""
-    lines = [np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, n), min(DEGREE, n - 1))
-             for n in shape]  # fmt: skip
+    lines = [
+        np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, n), min(DEGREE, n - 1))
+        for n in shape
+    ]
     terms = itertools.product(*(range(line.shape[1]) for line in lines))
     chosen = [term for term in terms if sum(term) <= DEGREE]
     lines_of = [[line[:, k] for line, k in zip(lines, term, strict=True)] for term in chosen]

@@ -71,8 +71,9 @@ def measure_deviation(
     StackError
         When no point lies over the reference.
     """
-    wanted = reference(points["x"].ravel().astype(np.float64),
-                       points["y"].ravel().astype(np.float64)).reshape(points.shape)  # fmt: skip
+    wanted = reference(
+        points["x"].ravel().astype(np.float64), points["y"].ravel().astype(np.float64)
+    ).reshape(points.shape)
     deviation = points["z"].astype(np.float64) - wanted
     over = np.isfinite(deviation)
     if not over.any():
@@ -91,13 +92,21 @@ def measure_deviation(
         found = residual
     form = float(np.mean(residual**2) - np.mean(kept.sigma_m**2))
     return DeviationMeasurement(
-        kind="deviation", value=0.0 if level else float(plane[0]),
-        uncertainty=float(np.sqrt(fit.covariance[0, 0])), unit="m", points=len(kept),
-        set_aside=len(chosen) - len(kept), rms_m=fit.rms_m, dof=fit.dof,
-        inflation=fit.inflation, region=region, form_rms_m=float(np.sqrt(max(form, 0.0))),
-        peak_m=float(found.max()), valley_m=float(found.min()),
+        kind="deviation",
+        value=0.0 if level else float(plane[0]),
+        uncertainty=float(np.sqrt(fit.covariance[0, 0])),
+        unit="m",
+        points=len(kept),
+        set_aside=len(chosen) - len(kept),
+        rms_m=fit.rms_m,
+        dof=fit.dof,
+        inflation=fit.inflation,
+        region=region,
+        form_rms_m=float(np.sqrt(max(form, 0.0))),
+        peak_m=float(found.max()),
+        valley_m=float(found.min()),
         deviation_m=deviation.astype(np.float32),
-    )  # fmt: skip
+    )
 
 
 def _design(xyz_m: Array, level: bool) -> Array:

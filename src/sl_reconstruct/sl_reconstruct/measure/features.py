@@ -71,21 +71,30 @@ def _profile(points: Points, numbers: Numbers) -> Measurement:
 
 
 FEATURES: dict[str, Feature] = {
-    "plane": Feature("plane and its flatness", RECTANGLE,
-                     lambda p, n: measure_plane(_chosen(p, n))),
+    "plane": Feature(
+        "plane and its flatness", RECTANGLE, lambda p, n: measure_plane(_chosen(p, n))
+    ),
     "angle": Feature("included angle of two planes", "RECTANGLE,RECTANGLE", _angle),
     "groove": Feature("included angle of a groove whose flanks are found", "", _groove),
-    "step": Feature("height of a step across x, ISO 5436-1", RECTANGLE,
-                    lambda p, n: measure_step(_chosen(p, n))),
-    "step-y": Feature("height of a step across y", RECTANGLE,
-                      lambda p, n: measure_step(_chosen(p, n), "y")),
-    "sphere": Feature("radius and centre of a sphere", RECTANGLE,
-                      lambda p, n: measure_sphere(_chosen(p, n))),
-    "cylinder": Feature("radius and axis of a cylinder", RECTANGLE,
-                        lambda p, n: measure_cylinder(_chosen(p, n))),
-    "hole": Feature("centre and diameter of the hole in a region", RECTANGLE,
-                    lambda p, n: measure_hole(p, _region(n))),
-    "roughness": Feature("areal roughness, ISO 25178", RECTANGLE,
-                         lambda p, n: measure_roughness(p, _region(n))),
+    "step": Feature(
+        "height of a step across x, ISO 5436-1", RECTANGLE, lambda p, n: measure_step(_chosen(p, n))
+    ),
+    "step-y": Feature(
+        "height of a step across y", RECTANGLE, lambda p, n: measure_step(_chosen(p, n), "y")
+    ),
+    "sphere": Feature(
+        "radius and centre of a sphere", RECTANGLE, lambda p, n: measure_sphere(_chosen(p, n))
+    ),
+    "cylinder": Feature(
+        "radius and axis of a cylinder", RECTANGLE, lambda p, n: measure_cylinder(_chosen(p, n))
+    ),
+    "hole": Feature(
+        "centre and diameter of the hole in a region",
+        RECTANGLE,
+        lambda p, n: measure_hole(p, _region(n)),
+    ),
+    "roughness": Feature(
+        "areal roughness, ISO 25178", RECTANGLE, lambda p, n: measure_roughness(p, _region(n))
+    ),
     "profile": Feature("section along a line; see --csv", "X0,Y0,X1,Y1[,WIDTH]", _profile),
-}  # fmt: skip
+}

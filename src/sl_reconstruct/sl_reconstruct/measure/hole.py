@@ -91,13 +91,20 @@ def measure_hole(points: NDArray[Any], region: Region | None = None) -> HoleMeas
     u = np.sqrt(np.diag(fit.covariance))
     # The strip's width lies somewhere between 0 and `strip`: its middle, and that of a rectangle.
     return HoleMeasurement(
-        kind="hole", value=float(2.0 * values[2] - strip),
-        uncertainty=float(2.0 * np.hypot(u[2], u_edge)), unit="m",
-        points=int(np.count_nonzero(used)), set_aside=int(np.count_nonzero(~used)),
-        rms_m=fit.rms_m, dof=fit.dof, inflation=fit.inflation, region=region,
-        centre_m=(float(values[0]), float(values[1])), u_centre_m=(float(u[0]), float(u[1])),
+        kind="hole",
+        value=float(2.0 * values[2] - strip),
+        uncertainty=float(2.0 * np.hypot(u[2], u_edge)),
+        unit="m",
+        points=int(np.count_nonzero(used)),
+        set_aside=int(np.count_nonzero(~used)),
+        rms_m=fit.rms_m,
+        dof=fit.dof,
+        inflation=fit.inflation,
+        region=region,
+        centre_m=(float(values[0]), float(values[1])),
+        u_centre_m=(float(u[0]), float(u[1])),
         method=method,
-    )  # fmt: skip
+    )
 
 
 def crossings(points: NDArray[Any], light: NDArray[Any]) -> tuple[Array, float]:
@@ -123,8 +130,10 @@ def crossings(points: NDArray[Any], light: NDArray[Any]) -> tuple[Array, float]:
         fa, fb = light[a] - EDGE_LEVEL, light[b] - EDGE_LEVEL
         crossed = np.isfinite(fa) & np.isfinite(fb) & (fa * fb < 0.0)
         fall = fa[crossed] - fb[crossed]
-        pa, pb = (np.stack([points[at][crossed][n].astype(np.float64) for n in ("x", "y")], axis=-1)
-                  for at in (a, b))  # fmt: skip
+        pa, pb = (
+            np.stack([points[at][crossed][n].astype(np.float64) for n in ("x", "y")], axis=-1)
+            for at in (a, b)
+        )
         found.append(pa + (fa[crossed] / fall)[:, None] * (pb - pa))
         ways.append(np.hypot(*(pb - pa).T) / np.abs(fall))
     edges = np.concatenate(found)

@@ -112,14 +112,22 @@ def measure_plane(chosen: Selection, flatness: bool = True) -> PlaneMeasurement:
     fit = uncertainties(jacobian, distance, sigma, points.xyz_m[:, :2])
     value = _flatness(local, distance, sigma) if flatness else Corrected(np.nan, np.nan)
     return PlaneMeasurement(
-        kind="plane", value=value.value, uncertainty=value.uncertainty, unit="m",
-        points=len(points), set_aside=len(chosen) - len(points), rms_m=fit.rms_m, dof=fit.dof,
-        inflation=fit.inflation, region=chosen.region,
-        normal=_three(plane.normal), point_m=_three(plane.point_m),
+        kind="plane",
+        value=value.value,
+        uncertainty=value.uncertainty,
+        unit="m",
+        points=len(points),
+        set_aside=len(chosen) - len(points),
+        rms_m=fit.rms_m,
+        dof=fit.dof,
+        inflation=fit.inflation,
+        region=chosen.region,
+        normal=_three(plane.normal),
+        point_m=_three(plane.point_m),
         tilts=tuple(map(tuple, tilts.tolist())),
         tilt_covariance=tuple(map(tuple, fit.covariance[1:, 1:].tolist())),
         **_explicit(plane, tilts, fit.covariance),
-    )  # fmt: skip
+    )
 
 
 def measure_angle(first: Selection, second: Selection) -> AngleMeasurement:
@@ -144,15 +152,23 @@ def measure_angle(first: Selection, second: Selection) -> AngleMeasurement:
         # d(angle) = -(other . dn) / sin(angle); where the planes are nearly one, any tilt counts.
         slopes = np.array(plane.tilts) @ other / crossed if crossed > 1e-9 else np.ones(2)
         variance += float(slopes @ np.array(plane.tilt_covariance) @ slopes)
-    rms = np.sqrt((one.rms_m**2 * one.points + two.rms_m**2 * two.points)
-                  / (one.points + two.points))  # fmt: skip
+    rms = np.sqrt(
+        (one.rms_m**2 * one.points + two.rms_m**2 * two.points) / (one.points + two.points)
+    )
     return AngleMeasurement(
-        kind="angle", value=180.0 - float(np.degrees(between)),
-        uncertainty=float(np.degrees(np.sqrt(variance))), unit="deg",
-        points=one.points + two.points, set_aside=one.set_aside + two.set_aside,
-        rms_m=float(rms), dof=one.dof + two.dof, inflation=max(one.inflation, two.inflation),
-        region=first.region, first=one, second=two,
-    )  # fmt: skip
+        kind="angle",
+        value=180.0 - float(np.degrees(between)),
+        uncertainty=float(np.degrees(np.sqrt(variance))),
+        unit="deg",
+        points=one.points + two.points,
+        set_aside=one.set_aside + two.set_aside,
+        rms_m=float(rms),
+        dof=one.dof + two.dof,
+        inflation=max(one.inflation, two.inflation),
+        region=first.region,
+        first=one,
+        second=two,
+    )
 
 
 def _tilts(normal: Array) -> Array:
@@ -168,13 +184,18 @@ def _explicit(plane: Plane, tilts: Array, covariance: Array) -> dict[str, float]
     x, y, z = plane.point_m
     a, b = -nx / nz, -ny / nz
     # A tilt t of slope e turns the normal by -e t; a = -nx / nz changes with it.
-    slopes = np.array([[t[0] / nz - nx * t[2] / nz**2, t[1] / nz - ny * t[2] / nz**2]
-                       for t in tilts]).T  # fmt: skip
+    slopes = np.array(
+        [[t[0] / nz - nx * t[2] / nz**2, t[1] / nz - ny * t[2] / nz**2] for t in tilts]
+    ).T
     u_a, u_b = np.sqrt(np.diag(slopes @ covariance[1:, 1:] @ slopes.T))
     return {
-        "a": float(a), "b": float(b), "c_m": float(z - a * x - b * y), "u_a": float(u_a),
-        "u_b": float(u_b), "u_c_m": float(np.sqrt(covariance[0, 0]) / nz),
-    }  # fmt: skip
+        "a": float(a),
+        "b": float(b),
+        "c_m": float(z - a * x - b * y),
+        "u_a": float(u_a),
+        "u_b": float(u_b),
+        "u_c_m": float(np.sqrt(covariance[0, 0]) / nz),
+    }
 
 
 def _flatness(local_m: Array, distance_m: Array, sigma_m: Array) -> Corrected:

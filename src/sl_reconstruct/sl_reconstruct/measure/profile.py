@@ -94,11 +94,22 @@ def measure_profile(
     total = peak_to_valley(z, u, np.isfinite(z))
     residual = chosen.xyz_m[:, 2] - np.interp(local[:, 0], s, z)
     return ProfileMeasurement(
-        kind="profile", value=total.value, uncertainty=total.uncertainty, unit="m",
-        points=len(chosen), set_aside=0, rms_m=float(np.sqrt(np.mean(residual**2))),
-        dof=len(chosen) - len(z), inflation=1.0, region=region, from_m=from_m, to_m=to_m,
-        along_m=s, z_m=z, u_z_m=u,
-    )  # fmt: skip
+        kind="profile",
+        value=total.value,
+        uncertainty=total.uncertainty,
+        unit="m",
+        points=len(chosen),
+        set_aside=0,
+        rms_m=float(np.sqrt(np.mean(residual**2))),
+        dof=len(chosen) - len(z),
+        inflation=1.0,
+        region=region,
+        from_m=from_m,
+        to_m=to_m,
+        along_m=s,
+        z_m=z,
+        u_z_m=u,
+    )
 
 
 def _means(
@@ -140,9 +151,12 @@ def _slope(x: Array, y: Array, squares: NDArray[Any], number: NDArray[np.int64])
 
 
 def _variance(
-    residual_m: Array, sigma_m: Array, number: NDArray[np.int64], count: NDArray[np.int64],
+    residual_m: Array,
+    sigma_m: Array,
+    number: NDArray[np.int64],
+    count: NDArray[np.int64],
     free: Array,
-) -> Array:  # fmt: skip
+) -> Array:
     """Of each bin's points: as stated, or their scatter where it is clearly more.
 
     Whichever is more would be too much: the scatter of few points is by chance.
@@ -168,5 +182,6 @@ def save_profile(path: str | Path, profile: ProfileMeasurement) -> None:
     """
     columns = np.column_stack([profile.along_m, profile.z_m, profile.u_z_m])
     with written_atomically(Path(path)) as partial:
-        np.savetxt(partial, columns, fmt="%.9e", delimiter=",",
-                   header="along_m,z_m,u_z_m", comments="")  # fmt: skip
+        np.savetxt(
+            partial, columns, fmt="%.9e", delimiter=",", header="along_m,z_m,u_z_m", comments=""
+        )

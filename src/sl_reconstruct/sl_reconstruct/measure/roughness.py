@@ -97,11 +97,21 @@ def measure_roughness(
     spread = {name: one.uncertainty for name, one in found.items()}
     count = int(np.count_nonzero(np.isfinite(height.z_m)))
     return RoughnessMeasurement(
-        kind="roughness", value=corrected["Sq"], uncertainty=spread["Sq"], unit="m",
-        points=int(np.count_nonzero(np.isfinite(cut["z"]))), set_aside=0, rms_m=raw["Sq"],
-        dof=count - 3, inflation=1.0, region=region, raw=raw, corrected=corrected,
-        uncertainties=spread, step_m=height.step_m,
-    )  # fmt: skip
+        kind="roughness",
+        value=corrected["Sq"],
+        uncertainty=spread["Sq"],
+        unit="m",
+        points=int(np.count_nonzero(np.isfinite(cut["z"]))),
+        set_aside=0,
+        rms_m=raw["Sq"],
+        dof=count - 3,
+        inflation=1.0,
+        region=region,
+        raw=raw,
+        corrected=corrected,
+        uncertainties=spread,
+        step_m=height.step_m,
+    )
 
 
 def areal_parameters(z_m: NDArray[Any], step_m: float) -> dict[str, float]:
@@ -209,10 +219,11 @@ def _corrected(
     told = areal_parameters(clean, height.step_m)
     drawn = [areal_parameters(clean + draw, height.step_m) for draw in noise[:DRAWS]]
     found = {
-        name: take_off(raw[name], told[name], np.array([one[name] for one in drawn]),
-                       name in SQUARES)
+        name: take_off(
+            raw[name], told[name], np.array([one[name] for one in drawn]), name in SQUARES
+        )
         for name in raw
-    }  # fmt: skip
+    }
     # Highest and lowest of levelled heights are Sp and Sv themselves.
     level = np.stack([_levelled(draw) for draw in noise])
     tops = extremes(inner, level, estimate, np.ones(inner.shape, np.bool_), beyond)

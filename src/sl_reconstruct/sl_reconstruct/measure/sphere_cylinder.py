@@ -77,13 +77,14 @@ def measure_sphere(chosen: Selection) -> SphereMeasurement:
     start = _algebraic_sphere(chosen.xyz_m)
     values, used, residual, jacobian, normal_z = fit_rounds(_sphere, chosen, start)
     points = chosen.at(used)
-    fit = uncertainties(jacobian, residual, points.sigma_m * np.abs(normal_z),
-                        points.xyz_m[:, :2])  # fmt: skip
+    fit = uncertainties(jacobian, residual, points.sigma_m * np.abs(normal_z), points.xyz_m[:, :2])
     u = np.sqrt(np.diag(fit.covariance))
     return SphereMeasurement(
-        kind="sphere", **_of_radius(values[3], u[3], fit, chosen, points),
-        centre_m=tuple(values[:3].tolist()), u_centre_m=tuple(u[:3].tolist()),
-    )  # fmt: skip
+        kind="sphere",
+        **_of_radius(values[3], u[3], fit, chosen, points),
+        centre_m=tuple(values[:3].tolist()),
+        u_centre_m=tuple(u[:3].tolist()),
+    )
 
 
 def measure_cylinder(chosen: Selection) -> CylinderMeasurement:
@@ -116,8 +117,9 @@ def measure_cylinder(chosen: Selection) -> CylinderMeasurement:
     return CylinderMeasurement(
         kind="cylinder",
         **_of_radius(values[4], np.sqrt(fit.covariance[4, 4]), fit, chosen, points),
-        point_m=tuple(point.tolist()), direction=tuple(direction.tolist()),
-    )  # fmt: skip
+        point_m=tuple(point.tolist()),
+        direction=tuple(direction.tolist()),
+    )
 
 
 def _of_radius(
@@ -125,10 +127,16 @@ def _of_radius(
 ) -> dict[str, Any]:
     """Fields that spheres and cylinders have alike."""
     return {
-        "value": float(radius_m), "uncertainty": float(u_m), "unit": "m", "points": len(used),
-        "set_aside": len(chosen) - len(used), "rms_m": fit.rms_m, "dof": fit.dof,
-        "inflation": fit.inflation, "region": chosen.region,
-    }  # fmt: skip
+        "value": float(radius_m),
+        "uncertainty": float(u_m),
+        "unit": "m",
+        "points": len(used),
+        "set_aside": len(chosen) - len(used),
+        "rms_m": fit.rms_m,
+        "dof": fit.dof,
+        "inflation": fit.inflation,
+        "region": chosen.region,
+    }
 
 
 def fit_rounds(
@@ -196,10 +204,15 @@ def _cylinder(values: Array, xyz_m: Array) -> tuple[Array, Array, Array]:
     length = np.sqrt(1.0 + my**2 + mz**2)
     along = offset @ np.array([1.0, my, mz]) / length**2
     distance = np.einsum("ij,ij->i", offset, normal)
-    jacobian = np.column_stack([
-        -normal[:, 1], -normal[:, 2], -normal[:, 1] * along, -normal[:, 2] * along,
-        -np.ones(len(xyz_m)),
-    ])  # fmt: skip
+    jacobian = np.column_stack(
+        [
+            -normal[:, 1],
+            -normal[:, 2],
+            -normal[:, 1] * along,
+            -normal[:, 2] * along,
+            -np.ones(len(xyz_m)),
+        ]
+    )
     return distance - radius, jacobian, normal[:, 2]
 
 

@@ -89,12 +89,21 @@ def measure_step(
     residual = points.xyz_m[:, 2] - jacobian @ found
     fit = uncertainties(jacobian, residual, points.sigma_m, points.xyz_m[:, :2])
     return StepMeasurement(
-        kind="step", value=float(found[3]), uncertainty=float(np.sqrt(fit.covariance[3, 3])),
-        unit="m", points=len(points), set_aside=int(np.count_nonzero(~used)), rms_m=fit.rms_m,
-        dof=fit.dof, inflation=fit.inflation, region=chosen.region,
-        walls_m=(float(left), float(right)), axis=axis, slope_x=float(found[0]),
+        kind="step",
+        value=float(found[3]),
+        uncertainty=float(np.sqrt(fit.covariance[3, 3])),
+        unit="m",
+        points=len(points),
+        set_aside=int(np.count_nonzero(~used)),
+        rms_m=fit.rms_m,
+        dof=fit.dof,
+        inflation=fit.inflation,
+        region=chosen.region,
+        walls_m=(float(left), float(right)),
+        axis=axis,
+        slope_x=float(found[0]),
         slope_y=float(found[1]),
-    )  # fmt: skip
+    )
 
 
 def find_walls(across_m: Array, z_m: Array) -> tuple[float, float]:
@@ -115,8 +124,9 @@ def find_walls(across_m: Array, z_m: Array) -> tuple[float, float]:
     number = np.minimum((count * (across_m - low) / max(span, 1e-30)).astype(int), count - 1)
     order = np.argsort(number, kind="stable")
     starts = np.searchsorted(number[order], np.arange(count + 1))
-    medians = np.array([np.median(z_m[order[a:b]]) if b > a else np.nan
-                        for a, b in itertools.pairwise(starts)])  # fmt: skip
+    medians = np.array(
+        [np.median(z_m[order[a:b]]) if b > a else np.nan for a, b in itertools.pairwise(starts)]
+    )
     there = np.flatnonzero(np.isfinite(medians))
     jumps = np.diff(medians[there])
     jumps = jumps - np.median(jumps)

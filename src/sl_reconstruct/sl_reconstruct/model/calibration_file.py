@@ -40,13 +40,18 @@ from sl_reconstruct.model.rig_validation import check_rig, nearest_rotation
 Array = NDArray[np.float64]
 
 FORMAT = 1
-_TOP_KEYS = (
-    "format", "camera", "projector", "covariance", "residuals", "made_from", "hash",
-)  # fmt: skip
+_TOP_KEYS = ("format", "camera", "projector", "covariance", "residuals", "made_from", "hash")
 _DEVICE_KEYS = (
-    "model", "kappa", "distortion", "image_size", "focal_length_px", "pixel_pitch_m",
-    "image_centre_px", "rotation", "translation_m",
-)  # fmt: skip
+    "model",
+    "kappa",
+    "distortion",
+    "image_size",
+    "focal_length_px",
+    "pixel_pitch_m",
+    "image_centre_px",
+    "rotation",
+    "translation_m",
+)
 
 
 @dataclass(frozen=True)

@@ -72,13 +72,16 @@ def read(
     rotation = _rotation(content, path)
     translation_m = _array(content, "translation", (3,), path) * factor
     camera = _device(
-        content, "camera", _size(content, "camera", camera_size, path),
-        np.eye(3), np.zeros(3), path,
-    )  # fmt: skip
+        content, "camera", _size(content, "camera", camera_size, path), np.eye(3), np.zeros(3), path
+    )
     projector = _device(
-        content, "projector", _size(content, "projector", projector_size, path),
-        rotation, translation_m, path,
-    )  # fmt: skip
+        content,
+        "projector",
+        _size(content, "projector", projector_size, path),
+        rotation,
+        translation_m,
+        path,
+    )
     made_from = {
         "file": path.name,
         "world": "camera frame",

@@ -77,9 +77,11 @@ def check_rig(rig: Rig, source: str) -> None:
         _check_device(device, f"{source}.{name}")
     baseline_m = float(np.linalg.norm(rig.camera.position_m - rig.projector.position_m))
     _check_range(
-        f"{source}: distance between camera and projector", baseline_m, BASELINE_M,
+        f"{source}: distance between camera and projector",
+        baseline_m,
+        BASELINE_M,
         "metres; are the translations in metres?",
-    )  # fmt: skip
+    )
     _check_working_distance(rig, source)
 
 
@@ -95,9 +97,11 @@ def _check_device(device: Device, where: str) -> None:
     width = device.image_size[0]
     for focal_px in device.focal_length_px:
         _check_range(
-            f"{where}.focal_length_px", focal_px,
-            (FOCAL_WIDTHS[0] * width, FOCAL_WIDTHS[1] * width), "pixels",
-        )  # fmt: skip
+            f"{where}.focal_length_px",
+            focal_px,
+            (FOCAL_WIDTHS[0] * width, FOCAL_WIDTHS[1] * width),
+            "pixels",
+        )
     middle = np.array(device.image_size) / 2
     off_px = float(np.linalg.norm(device.centre_px - middle))
     if off_px > MAX_CENTRE_WIDTHS * width:
@@ -158,6 +162,8 @@ def _check_working_distance(rig: Rig, source: str) -> None:
         )
     for name, distance_m in zip(("camera", "projector"), distances_m, strict=True):
         _check_range(
-            f"{source}: working distance of the {name}", distance_m, WORKING_DISTANCE_M,
+            f"{source}: working distance of the {name}",
+            distance_m,
+            WORKING_DISTANCE_M,
             "metres; are the translations in metres?",
-        )  # fmt: skip
+        )

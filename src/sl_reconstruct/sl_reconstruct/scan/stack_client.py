@@ -57,7 +57,19 @@ class StackClient:
         cancelled: Callable[[], bool],
         timeouts: ScanTimeouts,
     ) -> ScanResult:
-        """Take one stack; see `ScanRun` for the arguments. It blocks, and raises no `SlError`."""
+        """Take one stack; see `ScanRun` for the arguments. It blocks, and raises no `SlError`.
+
+        Parameters
+        ----------
+        request : ScanRequest
+            What to take.
+        tell : callable
+            Takes each `ScanProgress`.
+        cancelled : callable
+            Tells whether nobody wants it any more.
+        timeouts : ScanTimeouts
+            Longest waits.
+        """
         self._cancelled = cancelled
         try:
             return ScanRun(self, request, tell, cancelled, timeouts).run()
