@@ -10,7 +10,8 @@ from sl_bench.world.surfaces import make_surface
 from sl_bench.world.world import CACHED_FRAMES, World
 from sl_common.errors import ConfigError
 from sl_projector.sequence.pattern_sequence import Pattern, precise
-from support.scenes.bench_scenes import NOMINAL_S, PLAIN, pixel_grid, small_rig, small_world
+from support.scenes.bench_scenes import NOMINAL_S, PLAIN, pixel_grid, small_world
+from support.scenes.rigs import small_rig
 
 DMD = (1024, 768)
 WHITE = Pattern("white").frame(DMD)

@@ -1,17 +1,14 @@
 """Ground truth of the world against closed forms and the rig model, which it does not use."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from sl_bench.world.surfaces import make_surface
 from sl_bench.world.world import World
 from sl_common.errors import ConfigError
-from sl_reconstruct.model.rig import BrownConrady, Rig
-from support.scenes.bench_scenes import WINDOW, pixel_grid, small_rig, small_world, tilt
-
-FULL = (0, 0, 1600, 1200)
+from sl_reconstruct.model.rig import BrownConrady
+from support.scenes.bench_scenes import pixel_grid, small_world, tilt
+from support.scenes.rigs import FULL, MIDDLE, small_rig, with_lenses
 
 
 def on_rays(world: World, q: np.ndarray, points: np.ndarray) -> None:
@@ -63,11 +60,8 @@ def test_sphere_truth_is_on_the_near_side_of_the_sphere():
 
 def test_lens_kernels_of_both_models_agree_with_the_rig():
     rig = small_rig(FULL)
-    brown = [
-        replace(d, lens=BrownConrady((k, 2 * k, 1e-3, -5e-4, k)))
-        for d, k in ((rig.camera, -0.9), (rig.projector, 0.8))
-    ]
-    for r in (rig, Rig(*brown)):
+    brown = (BrownConrady((k, 2 * k, 1e-3, -5e-4, k)) for k in (-0.9, 0.8))
+    for r in (rig, with_lenses(rig, *brown)):
         world = World(r, make_surface("sphere_cap"))
         q = pixel_grid(world, 53)
         on_rays(world, q, world.truth_points(q))
@@ -191,5 +185,5 @@ def test_impossible_poses_are_refused(rotation, translation):
 def test_window_of_the_camera_sees_what_the_whole_camera_sees():
     whole, part = small_world("coin", window=FULL), small_world("coin")
     q = pixel_grid(part, 29)
-    shift = np.array(WINDOW[:2])
+    shift = np.array(MIDDLE[:2])
     assert part.truth_points(q) == pytest.approx(whole.truth_points(q + shift), abs=1e-12)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -120,9 +122,6 @@ def test_triangle_by_blocks_is_the_triangle() -> None:
 
 
 def test_only_the_papers_lens_is_bundled() -> None:
-    other = Device(
-        RIG.camera.image_size, RIG.camera.focal_length_px, RIG.camera.image_centre_px, 1e-5,
-        RIG.camera.rotation, RIG.camera.translation_m, BrownConrady(),
-    )  # fmt: skip
+    other = replace(RIG.camera, lens=BrownConrady())
     with pytest.raises(CalibrationError, match="expected the paper's model"):
         project(other, POINTS)

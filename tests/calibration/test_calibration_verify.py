@@ -21,9 +21,10 @@ from sl_calibration.workflow.calibrator import Calibrator, InForce, VerifyOutcom
 from sl_common.errors import CalibrationError
 from sl_projector.sequence.stack import Stack
 from sl_reconstruct.model.calibration_file import Calibration
-from sl_reconstruct.model.rig import Device, Rig
+from sl_reconstruct.model.rig import Rig
 from support.devices.calibration_bench import PITCHES, START, FakeRig, look_with
 from support.scenes.calibration_scenes import RIG, Scene
+from support.scenes.rigs import rotation, turned
 
 HEIGHTS_M = (-0.8e-3, 0.0, 0.8e-3)
 
@@ -105,7 +106,7 @@ def moved(scale: float) -> Rig:
         # A world 0.1 % too large: the plate's pitch says so.
         (lambda: moved(1.001), "pitch_error is 0.001"),
         # The camera turned by 0.1 mrad about its x axis: rays miss by 14 um at 137 mm.
-        (lambda: Rig(turned(1e-4), RIG.projector), "ray_gap_m is"),
+        (lambda: Rig(turned(RIG.camera, rotation(1e-4, 0.0, 0.0)), RIG.projector), "ray_gap_m is"),
         # The camera's lens without its distortion: 1.2e-8 * 800^2 is 0.8 % at the border.
         (lambda: Rig(replace(RIG.camera, lens=type(RIG.camera.lens)(0.0)), RIG.projector),
          "lattice_m is"),
@@ -119,15 +120,6 @@ def test_each_kind_of_error_is_named(
     assert found.recalibrate
     assert reason in found.message
     assert "recalibrate (" in found.message
-
-
-def turned(angle_rad: float) -> Device:
-    """The reference camera, turned where it stands."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    about_x = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
-    camera = RIG.camera
-    translation_m = about_x @ camera.translation_m
-    return replace(camera, rotation=about_x @ camera.rotation, translation_m=translation_m)
 
 
 def test_a_flat_has_no_pitch_and_no_lattice(checked: Checked) -> None:

@@ -33,7 +33,8 @@ from sl_reconstruct.model.calibration_file import dump_calibration, rig_hash, sa
 from sl_reconstruct.reconstruct_node import ReconstructNode  # noqa: E402
 from support.patience import wait  # noqa: E402
 from support.ros_graph import Graph  # noqa: E402
-from support.scenes.tiny_scans import SLOPE, tiny_rig, tiny_sequence  # noqa: E402
+from support.scenes.rigs import tiny_rig  # noqa: E402
+from support.scenes.tiny_scans import SLOPE, tiny_sequence  # noqa: E402
 from support.tiny_graph import (  # noqa: E402
     PERIOD_NS,
     PLANE_TOLERANCE_M,

@@ -31,7 +31,7 @@ from sl_reconstruct.reconstruct_node import ReconstructNode  # noqa: E402
 from support.devices.fake_devices import FakeProjector, FakeStage, WiredPair  # noqa: E402
 from support.patience import PATIENCE_S, patience, wait  # noqa: E402
 from support.ros_graph import Graph  # noqa: E402
-from support.scenes.tiny_scans import tiny_rig  # noqa: E402
+from support.scenes.rigs import tiny_rig  # noqa: E402
 from support.tiny_graph import assert_plane, calibrated_by, frames, tiny_projector  # noqa: E402
 
 

@@ -24,7 +24,8 @@ from sl_common.errors import SlError
 from sl_common.topics import CALIBRATION, EVALUATED_TOPICS
 from sl_reconstruct.cloud.cloud_reader import read_cloud
 from sl_reconstruct.model.calibration_file import Calibration
-from support.scenes.tiny_scans import HEIGHT_M, SLOPE, render, tiny_rig, tiny_sequence
+from support.scenes.rigs import tiny_rig
+from support.scenes.tiny_scans import HEIGHT_M, SLOPE, render, tiny_sequence
 
 #: Kinds of bags; only the recorder's own have checksums.
 KINDS = ("recorder", "compressed", "split", "rosbags", "sqlite3")

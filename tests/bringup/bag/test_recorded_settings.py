@@ -18,7 +18,8 @@ from sl_common.topics import CAMERA_SETTINGS, MATCHING, REPORT, SETTINGS, Topic
 from sl_reconstruct.decode import stack_statistics
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.model.calibration_file import Calibration
-from support.scenes.tiny_scans import render, tiny_rig, tiny_sequence
+from support.scenes.rigs import tiny_rig
+from support.scenes.tiny_scans import render, tiny_sequence
 
 
 @pytest.fixture(scope="module")

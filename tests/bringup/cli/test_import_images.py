@@ -17,14 +17,8 @@ from sl_common.topics import CALIBRATION, IMAGE, POSE, TRIGGER
 from sl_projector.sequence.pattern_sequence import named
 from sl_projector.sequence.sequence_file import SequenceFile, load_sequence_file
 from sl_reconstruct.model.calibration_file import rig_hash, save_calibration
-from support.scenes.tiny_scans import (
-    CAMERA_SIZE,
-    DMD_SIZE,
-    render,
-    tiny_rig,
-    tiny_sequence,
-    write_images,
-)
+from support.scenes.rigs import CAMERA_SIZE, DMD_SIZE, tiny_rig
+from support.scenes.tiny_scans import render, tiny_sequence, write_images
 
 DMD = "x".join(map(str, DMD_SIZE))
 

@@ -21,15 +21,8 @@ from sl_projector.sequence.pattern_sequence import PatternSequence
 from sl_reconstruct.model.calibration_file import Calibration, rig_hash, save_calibration
 from sl_reconstruct.model.rig import Rig
 from support.paths import DATA, EXAMPLES
-from support.scenes.tiny_scans import (
-    DMD_SIZE,
-    HEIGHT_M,
-    SLOPE,
-    render,
-    tiny_rig,
-    tiny_sequence,
-    write_images,
-)
+from support.scenes.rigs import DMD_SIZE, tiny_rig
+from support.scenes.tiny_scans import HEIGHT_M, SLOPE, render, tiny_sequence, write_images
 
 BOARD = DATA / "procam_board"
 EXAMPLE = EXAMPLES / "procam_board.yaml"

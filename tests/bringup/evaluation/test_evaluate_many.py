@@ -21,7 +21,8 @@ from sl_reconstruct.messages import report_to_msg
 from sl_reconstruct.model.calibration_file import Calibration, save_calibration
 from sl_reconstruct.model.rig import Rig
 from sl_reconstruct.scan.scan_summary import ScanSummary
-from support.scenes.tiny_scans import render, tiny_rig, tiny_sequence
+from support.scenes.rigs import tiny_rig
+from support.scenes.tiny_scans import render, tiny_sequence
 
 START_NS = 1_700_000_000_000_000_000
 FRAME_NS = 20_000_000

@@ -20,7 +20,8 @@ from sl_reconstruct.messages import EDGE_FIGURES, report_from_msg, report_to_msg
 from sl_reconstruct.model.calibration_file import Calibration
 from sl_reconstruct.reconstruction.reconstructor_cache import Workshop
 from sl_reconstruct.scan.scan_summary import ScanSummary
-from support.scenes.tiny_scans import render, tiny_rig, tiny_sequence
+from support.scenes.rigs import tiny_rig
+from support.scenes.tiny_scans import render, tiny_sequence
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,8 @@ from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.decode.types import Lines, Noise, line_at
 from sl_reconstruct.reconstruction.correspondence import decode_columns
 from sl_reconstruct.reconstruction.reconstructor import Reconstructor
-from support.scenes.bench_scenes import NOMINAL_S, small_rig, tilt
+from support.scenes.bench_scenes import NOMINAL_S, tilt
+from support.scenes.rigs import small_rig
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,8 @@ from sl_reconstruct.cloud.cloud import Cloud
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.decode.stack_statistics import full_scale_dn, saturation_of
 from sl_reconstruct.reconstruction.reconstructor import Reconstructor
-from support.scenes.stripe_scenes import WHITE_DN, Plane, expose, noiseless, small_rig
+from support.scenes.rigs import STRIP, small_rig
+from support.scenes.stripe_scenes import WHITE_DN, Plane, expose, noiseless
 
 
 @pytest.mark.parametrize("bits", [10, 12, 14, 16])
@@ -38,10 +39,10 @@ def test_eight_bits_and_darkness() -> None:
 @cache
 def overexposed(shift: int) -> tuple[np.ndarray, Cloud]:
     """A 12-bit stack at twice the full scale's light in its left half, and its cloud."""
-    mean = noiseless(Plane(small_rig()), named("precise"))
+    mean = noiseless(Plane(small_rig(STRIP)), named("precise"))
     mean[:, :, : mean.shape[2] // 2] *= 2 * 255 / WHITE_DN
     stack = expose(mean, 3, full_scale=4095) << shift
-    return stack, Reconstructor(small_rig(), named("precise"))(stack)
+    return stack, Reconstructor(small_rig(STRIP), named("precise"))(stack)
 
 
 @pytest.mark.parametrize("shift", [0, 4])
@@ -49,8 +50,8 @@ def test_saturated_stripes_of_twelve_bits_are_refused(shift: int) -> None:
     """Without being told the bits; with 65535 for the full scale they would pass for edges."""
     stack, cloud = overexposed(shift)
     told = Settings(saturation_dn=4095 << shift)
-    same = Reconstructor(small_rig(), named("precise"), told)(stack)
+    same = Reconstructor(small_rig(STRIP), named("precise"), told)(stack)
     assert cloud.points.tobytes() == same.points.tobytes()
     assert cloud.refused["saturation"] > 0.4 * cloud.lit  # the left half
     blind = Settings(saturation_dn=65535)
-    assert not Reconstructor(small_rig(), named("precise"), blind)(stack).refused["saturation"]
+    assert not Reconstructor(small_rig(STRIP), named("precise"), blind)(stack).refused["saturation"]

@@ -15,7 +15,8 @@ from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence, nam
 from sl_reconstruct.decode.illumination_check import check_illumination
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.reconstruction.reconstructor import Reconstructor
-from support.scenes.stripe_scenes import WHITE_DN, Plane, expose, noiseless, small_rig
+from support.scenes.rigs import STRIP, small_rig
+from support.scenes.stripe_scenes import WHITE_DN, Plane, expose, noiseless
 
 #: Gray images, all of which can be judged, white where there is one, fine ones with and without
 #: an inverse.
@@ -29,7 +30,7 @@ SEQUENCES = ("paper", "precise", "paper-rows")
 @cache
 def images(name: str, blur_px: float = 1.14) -> np.ndarray:
     height = 120 if "rows" in name else 48
-    return noiseless(Plane(small_rig(700, height)), named(name), blur_px)
+    return noiseless(Plane(small_rig((*STRIP[:3], height))), named(name), blur_px)
 
 
 def flickered(name: str, image: int, factor: float, seed: int = 1) -> np.ndarray:
@@ -87,7 +88,7 @@ def test_the_limit_is_the_one_of_the_settings(name: str, image: int) -> None:
 
 @pytest.mark.parametrize(("name", "image"), [("paper", 9), ("precise", 12)])
 def test_the_reconstruction_refuses_it(name: str, image: int) -> None:
-    reconstructor = Reconstructor(small_rig(), named(name))
+    reconstructor = Reconstructor(small_rig(STRIP), named(name))
     with pytest.raises(StackError, match=f"image {image}: "):
         reconstructor(flickered(name, image, 1.1))
     light = reconstructor(expose(images(name), 2)).figures.light_change
@@ -124,7 +125,7 @@ def test_pairs_alone_have_no_white_to_compare_with() -> None:
     """Ten Gray bits in pairs, no white, no black: the finest are blurred, yet pairs agree."""
     gray = [Pattern("gray", "column", bit, 9, 2) for bit in range(9)]
     sequence = PatternSequence("g", (1024, 768), tuple(q for p in gray for q in (p, p.inverse())))
-    mean = noiseless(Plane(small_rig()), sequence, 2.5)
+    mean = noiseless(Plane(small_rig(STRIP)), sequence, 2.5)
     known = sequence, Settings(), 255, 2.5, SCALE_PX
     assert check_illumination(expose(mean, 1), *known) < 0.01
     for image in (5, 16):

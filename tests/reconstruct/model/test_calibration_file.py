@@ -25,26 +25,10 @@ from sl_reconstruct.model.calibration_file import (
 )
 from sl_reconstruct.model.rig import BrownConrady, Device, Rig
 from support.paths import DATA
+from support.scenes.rigs import odd_rig, rotation
 
 BOARD = DATA / "procam_board"
 needs_board = pytest.mark.skipif(not BOARD.is_dir(), reason=f"no data in {BOARD}")
-
-
-def turned(angles_rad: tuple[float, float, float]) -> np.ndarray:
-    """A rotation without a single round number in it."""
-    return cv2.Rodrigues(np.array(angles_rad))[0]
-
-
-def odd_rig() -> Rig:
-    """A rig in which every number differs from every other and none is short in decimal."""
-    rig = reference_rig()
-    camera = replace(
-        rig.camera,
-        focal_length_px=(16911.1 / 3, 16913.7 / 3),
-        rotation=turned((0.1, 0.01, -0.02)) @ rig.camera.rotation,
-        lens=BrownConrady((0.1 / 3, -0.2 / 3, 0.001 / 3, -0.002 / 3, 0.01 / 3)),
-    )
-    return Rig(camera, rig.projector)
 
 
 def document(rig: Rig | None = None) -> dict:
@@ -292,7 +276,7 @@ def stereo_files(folder: Path) -> list[Path]:
         "cam_dist": np.array([[-0.25, 0.24, 0.001, -0.002, 0.0]]),
         "proj_int": np.array([[1888.0, 0, 511], [0, 1887, 850], [0, 0, 1]]),
         "proj_dist": np.array([[-0.15], [0.21], [0.0], [0.0]]),
-        "rotation": turned((0.01, -0.06, -0.02)),
+        "rotation": rotation(0.01, -0.06, -0.02),
         "translation": np.array([[95.65], [-623.89], [-240.0]]),
         "img_shape": np.array([[1024.0], [1280.0]]),
     }

@@ -13,7 +13,8 @@ from sl_bench.world.world import World
 from sl_projector.sequence.pattern_sequence import named
 from sl_reconstruct.cloud.cloud import Cloud
 from sl_reconstruct.reconstruction.reconstructor import Reconstructor
-from support.scenes.bench_scenes import NOMINAL_S, small_rig, tilt
+from support.scenes.bench_scenes import NOMINAL_S, tilt
+from support.scenes.rigs import small_rig
 
 #: Windows of the camera (left, top, width, height) that hold what is to be measured.
 WIDE, TALL = (500, 560, 640, 64), (700, 480, 300, 220)

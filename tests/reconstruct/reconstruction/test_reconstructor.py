@@ -16,6 +16,7 @@ from sl_reconstruct.decode.decode_plan import DecodePlan
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.model.rig import Rig
 from sl_reconstruct.reconstruction.reconstructor import Reconstructor
+from support.scenes.rigs import STRIP, small_rig, upside_down
 from support.scenes.stripe_scenes import (
     AMBIENT,
     BLUR_PX,
@@ -25,8 +26,6 @@ from support.scenes.stripe_scenes import (
     Plane,
     expose,
     noiseless,
-    small_rig,
-    turned,
 )  # fmt: skip
 
 SEQUENCES = ("paper", "precise")
@@ -36,7 +35,7 @@ TILT = {"offset_m": 2e-5, "slope_x": 0.03, "slope_y": -0.02}
 
 @cache
 def flat_images(name: str) -> np.ndarray:
-    return noiseless(Plane(small_rig(), **TILT), named(name))
+    return noiseless(Plane(small_rig(STRIP), **TILT), named(name))
 
 
 @cache
@@ -47,14 +46,15 @@ def flat_stack(name: str, seed: int | None = 1) -> np.ndarray:
 @cache
 def truth() -> tuple[np.ndarray, np.ndarray]:
     """True columns (H, K), and z of the plane at them."""
-    scene = Plane(small_rig(), **TILT)
+    scene = Plane(small_rig(STRIP), **TILT)
     u = scene.edges_px(1024)
     rows = np.broadcast_to(np.arange(u.shape[0], dtype=float)[:, None], u.shape)
     return u, scene.points_m(np.stack([u, rows], axis=-1))[..., 2]
 
 
 def run(name: str, stack: np.ndarray, estimator: str = "matched", **kwargs: object):
-    return Reconstructor(small_rig(), named(name), Settings(estimator=estimator, **kwargs))(stack)
+    settings = Settings(estimator=estimator, **kwargs)
+    return Reconstructor(small_rig(STRIP), named(name), settings)(stack)
 
 
 # -- plan -----------------------------------------------------------------------------------
@@ -175,7 +175,7 @@ def test_noise_and_blur_are_measured() -> None:
 @pytest.mark.parametrize("name", SEQUENCES)
 def test_albedo_does_not_move_edges(name: str) -> None:
     """A texture that varies by a factor of two over 40 px, unblurred: less than 0.01 px."""
-    scene = Plane(small_rig(), **TILT)
+    scene = Plane(small_rig(STRIP), **TILT)
     images = noiseless(scene, named(name), albedo=lambda g: 0.75 + 0.25 * np.sin(g[..., 0] / 5))
     error = run(name, expose(images, None)).u_px - truth()[0]
     error = error[:, np.isfinite(error).sum(axis=0) > 40]
@@ -188,9 +188,9 @@ def test_albedo_does_not_move_edges(name: str) -> None:
 
 @pytest.mark.parametrize("name", SEQUENCES)
 def test_a_turned_camera_measures_the_same_plane(name: str) -> None:
-    rig = small_rig()
+    rig = small_rig(STRIP)
     stack = np.ascontiguousarray(flat_stack(name)[:, ::-1, ::-1])
-    cloud = Reconstructor(Rig(turned(rig.camera), rig.projector), named(name))(stack)
+    cloud = Reconstructor(Rig(upside_down(rig.camera), rig.projector), named(name))(stack)
     straight = run(name, flat_stack(name))
     assert cloud.figures.scale_px == pytest.approx(-straight.figures.scale_px, rel=1e-3)
     z, same = cloud.points["z"][::-1], straight.points["z"]
@@ -227,7 +227,7 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_calls_leave_earlier_clouds_alone() -> None:
-    reconstruct = Reconstructor(small_rig(), named("paper"))
+    reconstruct = Reconstructor(small_rig(STRIP), named("paper"))
     first = reconstruct(flat_stack("paper"))
     kept = first.points.copy(), first.u_px.copy()
     reconstruct(np.zeros_like(flat_stack("paper")))
@@ -307,7 +307,7 @@ def test_a_stack_of_the_wrong_shape_is_refused(damage: object) -> None:
 
 def test_a_sequence_for_another_dmd_is_refused() -> None:
     with pytest.raises(StackError, match="912"):
-        Reconstructor(small_rig(), named("paper", (912, 1140)))
+        Reconstructor(small_rig(STRIP), named("paper", (912, 1140)))
 
 
 # -- frames out of place --------------------------------------------------------------------
@@ -331,7 +331,7 @@ def misplaced(name: str) -> list[list[int]]:
 def test_images_out_of_place_never_become_wrong_points(name: str) -> None:
     """Refused as a stack, or every point that is left is right to 20 micrometres."""
     stack, z = flat_stack(name), truth()[1]
-    reconstruct = Reconstructor(small_rig(), named(name))
+    reconstruct = Reconstructor(small_rig(STRIP), named(name))
     wrong = []
     for order in misplaced(name):
         try:
@@ -350,7 +350,7 @@ def test_images_out_of_place_never_become_wrong_points(name: str) -> None:
 
 def test_rows_give_the_dmd_row_and_the_miss_of_the_rays() -> None:
     """v from interpolated boundaries; rays of the true rig meet within the noise of v."""
-    rig = small_rig(width=320, height=120)
+    rig = small_rig((*STRIP[:2], 320, 120))
     scene = Plane(rig, **TILT)
     sequence = named("precise-rows")
     cloud = Reconstructor(rig, sequence)(expose(noiseless(scene, sequence), 4))
@@ -370,7 +370,7 @@ def test_rows_give_the_dmd_row_and_the_miss_of_the_rays() -> None:
 
 def test_a_cloud_does_not_depend_on_the_stack_before() -> None:
     """What an earlier stack left in the memory of a reconstructor must not reach sigma."""
-    rig, sequence = small_rig(width=320, height=120), named("precise-rows")
+    rig, sequence = small_rig((*STRIP[:2], 320, 120)), named("precise-rows")
     whole = expose(noiseless(Plane(rig, **TILT), sequence), 4)
     half = whole.copy()
     half[:, :, 160:] = np.rint(WHITE_DN * AMBIENT)

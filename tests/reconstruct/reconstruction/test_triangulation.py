@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -22,6 +20,7 @@ from sl_reconstruct.model.geometry import (
 )
 from sl_reconstruct.model.rig import BrownConrady, Division, Rig
 from sl_reconstruct.reconstruction.four_equation import Sight, miss_m, solve_four
+from support.scenes.rigs import with_lenses
 
 LENSES = {
     "paper": (Division(1.2e-8), Division(3.76e-8)),
@@ -36,8 +35,7 @@ LENSES = {
 
 
 def rig_with(lenses: str) -> Rig:
-    rig, (camera, projector) = reference_rig(), LENSES[lenses]
-    return Rig(replace(rig.camera, lens=camera), replace(rig.projector, lens=projector))
+    return with_lenses(reference_rig(), *LENSES[lenses])
 
 
 def volume(n: int = 300) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,10 +54,9 @@ class Scene:
 
     def _placed(self, device: Device) -> Device:
         rotation, offset = self.mounting.pose((0.0, 0.0, 0.0))
-        return Device(
-            device.image_size, device.focal_length_px, device.image_centre_px,
-            device.pixel_pitch_m, device.rotation @ rotation,
-            device.rotation @ offset + device.translation_m, device.lens,
+        return replace(
+            device, rotation=device.rotation @ rotation,
+            translation_m=device.rotation @ offset + device.translation_m,
         )  # fmt: skip
 
     def holes(self, rng: np.random.Generator, stage_m: Array) -> Array:

@@ -7,40 +7,17 @@ into the DMD, and every edge of a pattern adds ``Phi((x_k - x) / s)`` along the 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ndtr
 
-from sl_bench.world.reference_rig import reference_rig
 from sl_projector.sequence.pattern_sequence import Pattern, PatternSequence
-from sl_reconstruct.model.rig import Device, Rig
+from sl_reconstruct.model.rig import Rig
 
 #: White, ambient part, read noise and electrons per DN of the reference bench (design.md).
 WHITE_DN, AMBIENT, READ_DN, E_PER_DN = 190.0, 0.03, 0.5, 20000 / 255
 BLUR_PX = 1.14
-
-
-def window(rig: Rig, left: int, top: int, width: int, height: int) -> Rig:
-    """The rig with a camera that reads out a window only."""
-    u, v = rig.camera.image_centre_px
-    camera = replace(rig.camera, image_size=(width, height), image_centre_px=(u - left, v - top))
-    return Rig(camera, rig.projector)
-
-
-def small_rig(width: int = 700, height: int = 48) -> Rig:
-    """A window in the middle of the reference camera."""
-    return window(reference_rig(), 450, 560, width, height)
-
-
-def turned(camera: Device) -> Device:
-    """The camera turned by 180 degrees about its axis: sees the same, upside down."""
-    half = np.diag([-1.0, -1.0, 1.0])
-    (width, height), (u, v) = camera.image_size, camera.image_centre_px
-    return replace(
-        camera, rotation=half @ camera.rotation, translation_m=half @ camera.translation_m,
-        image_centre_px=(width - 1 - u, height - 1 - v),
-    )  # fmt: skip
 
 
 @dataclass
@@ -88,7 +65,9 @@ class Plane:
         return out
 
 
-def light(pattern: Pattern, size: int, coordinate: np.ndarray, blur_px: np.ndarray) -> np.ndarray:
+def light(
+    pattern: Pattern, size: int, coordinate: np.ndarray, blur_px: np.ndarray | float
+) -> np.ndarray:
     """Part of full light at DMD coordinates, for a blur in DMD pixels."""
     profile = pattern.profile(size).astype(float)
     step = np.diff(np.concatenate([[0.0], profile, [0.0]]))
