@@ -12,7 +12,7 @@ from sl_common import topics
 from sl_common.base_node import RigNode
 from sl_common.errors import StackError
 from sl_reconstruct.cloud.cloud_reader import read_cloud
-from sl_reconstruct.measure.request import Answer, MeasurementRequest, carry_out
+from sl_reconstruct.measure.request import Answer, MeasurementRequest, measure_cloud
 
 
 class _Source(NamedTuple):
@@ -52,7 +52,7 @@ class MeasureService:
         response.value = response.uncertainty = math.nan
         source = self._source(request.cloud_file)
         response.cloud = source.name
-        _fill(response, carry_out(_order(request), source.points))
+        _fill(response, measure_cloud(_order(request), source.points))
 
     def _source(self, file: str) -> _Source:
         if file:

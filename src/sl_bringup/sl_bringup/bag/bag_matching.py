@@ -10,11 +10,12 @@ from collections.abc import Iterator
 
 from sl_bringup.bag.bags import Bag, Recorded
 from sl_camera.messages import image_event, trigger_event
-from sl_camera.sync.match_events import FrameDecision
+from sl_camera.sync.match_events import FrameDecision, MatcherSettings
 from sl_camera.sync.matching import StackMatcher
 from sl_common.errors import SequenceError
 from sl_common.topics import IMAGE, POSE, TRIGGER
 from sl_projector.sequence.messages import pose_from_msg
+from sl_projector.sequence.stack import Stack
 
 #: At the end of a bag time passes until every scan has its verdict.
 END_NS = 3_600_000_000_000
@@ -36,6 +37,21 @@ def decisions(bag: Bag, matcher: StackMatcher) -> Iterator[FrameDecision]:
         now_ns = max(now_ns, recorded.received_ns)
         yield from _feed(bag, matcher, recorded, now_ns)
     yield from matcher.tick(now_ns + END_NS)
+
+
+def stacks(bag: Bag, settings: MatcherSettings | None = None) -> Iterator[Stack]:
+    """Yield the complete stacks of a bag; what is incomplete or spoilt is left out.
+
+    Parameters
+    ----------
+    bag : Bag
+        The recording.
+    settings : MatcherSettings, optional
+        How strictly triggers, images and poses are matched.
+    """
+    for decision in decisions(bag, StackMatcher(settings or MatcherSettings())):
+        if decision.stack is not None:
+            yield decision.stack
 
 
 def _feed(bag: Bag, matcher: StackMatcher, recorded: Recorded, now_ns: int) -> list[FrameDecision]:

@@ -90,7 +90,7 @@ class Answer:
         return f"{line}; {judged}: {self.verdict}"
 
 
-def carry_out(order: MeasurementRequest, points: Points) -> Answer:
+def measure_cloud(order: MeasurementRequest, points: Points) -> Answer:
     """Measure a cloud.
 
     Parameters
