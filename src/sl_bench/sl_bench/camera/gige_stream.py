@@ -30,38 +30,23 @@ LAST_BLOCK = 65535
 
 @dataclass(frozen=True)
 class StreamFrame:
-    """One frame to be sent.
+    """One frame to be sent."""
 
-    Parameters
-    ----------
-    number : int
-        Counted by the camera from 1; becomes the block id.
-    data : bytes
-        Pixels as they go over the wire.
-    size : tuple of int
-        (width, height), pixels.
-    offset : tuple of int
-        (x, y) of the region, pixels.
-    pixel_format : int
-        PFNC code.
-    ticks : int
-        Start of the exposure, the camera's clock, nanoseconds.
-    exposure_s : float
-        Exposure, seconds.
-    chunks : bool
-        Whether number, time and exposure follow the pixels.
-    complete : bool
-        False: the second half of the pixels never comes, not even when asked for again.
-    """
-
+    #: Counted by the camera from 1; becomes the block id.
     number: int
+    #: Pixels as they go over the wire.
     data: bytes
+    #: (width, height) and (x, y) of the region, pixels.
     size: tuple[int, int]
     offset: tuple[int, int]
+    #: PFNC code.
     pixel_format: int
+    #: Start of the exposure, the camera's clock, nanoseconds.
     ticks: int
     exposure_s: float
+    #: Whether number, time and exposure follow the pixels.
     chunks: bool
+    #: False: the second half of the pixels never comes, not even when asked for again.
     complete: bool
 
     @property

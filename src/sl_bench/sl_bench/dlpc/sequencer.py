@@ -19,61 +19,39 @@ OnExposure = Callable[[Mirrors, int, int, float], None]
 
 @dataclass(frozen=True)
 class Slot:
-    """One pattern of the sequence as the pattern table defines it.
-
-    Parameters
-    ----------
-    image, bit, depth : int
-        The image, its first bit plane that is shown, and how many.
-    exposure_us, dark_us : int
-        Lit, then dark, microseconds.
-    wait_trigger : bool
-        Whether it begins at an edge of TRIG_IN_1.
-    trigger_out_2 : bool
-        Whether it raises an edge of the second trigger output.
-    """
+    """One pattern of the sequence as the pattern table defines it."""
 
     image: int
+    #: First bit plane of the image that is shown, and how many.
     bit: int
     depth: int
     exposure_us: int
     dark_us: int
+    #: Begin at an edge of TRIG_IN_1.
     wait_trigger: bool
+    #: Raise an edge of the second trigger output.
     trigger_out_2: bool = True
 
 
 @dataclass(frozen=True)
 class Program:
-    """What a start command starts.
-
-    Parameters
-    ----------
-    slots : tuple of Slot
-        The pattern table.
-    exposures : int
-        Patterns to show; 0 repeats the table for ever.
-    first : int
-        Exposure to begin with (after a pause).
-    mirrors_of : callable
-        Renders a slot.
-    camera_output : int
-        The trigger output that the camera is wired to: 1 is high through each exposure, and so
-        stays high between patterns without dark time; 2 marks the start of each pattern.
-    edge_delay_us : int
-        Delay of that output's rising edge.
-    trigger_in_delay_us : int
-        From the edge on TRIG_IN_1 to the exposure.
-    halt : Event
-        Ends the program when it is set.
-    """
+    """What a start command starts."""
 
     slots: tuple[Slot, ...]
+    #: Patterns to show; 0 repeats the table for ever.
     exposures: int
+    #: Exposure to begin with, after a pause.
     first: int
+    #: Renders a slot.
     mirrors_of: Callable[[Slot], Mirrors]
+    #: The trigger output that the camera is wired to: 1 is high through each exposure, and so
+    #: stays high between patterns without dark time; 2 marks the start of each pattern.
     camera_output: int
+    #: Delay of that output's rising edge.
     edge_delay_us: int
+    #: From the edge on TRIG_IN_1 to the exposure.
     trigger_in_delay_us: int
+    #: Ends the program when it is set.
     halt: threading.Event = field(default_factory=threading.Event)
 
 

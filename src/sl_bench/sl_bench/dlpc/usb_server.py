@@ -67,6 +67,12 @@ class EmulatedUsb:
         Whether the device is on the bus.
     unplugged : int
         How often it was taken out.
+    owner : EmulatedLink or None
+        The host that has claimed the interface.
+    replies : deque
+        Reports for the host, each with the time from which it can be read.
+    ready : Condition
+        Guards owner and replies, and announces replies.
     """
 
     def __init__(self, device: HidDevice, identity: UsbIdentity = DLPC900_IDENTITY) -> None:
@@ -74,14 +80,14 @@ class EmulatedUsb:
         self.identity = identity
         self.present = True
         self.unplugged = 0
-        self._owner: EmulatedLink | None = None
-        self._replies: deque[tuple[float, bytes]] = deque(maxlen=MAX_QUEUED_REPORTS)
-        self._ready = threading.Condition()
+        self.owner: EmulatedLink | None = None
+        self.replies: deque[tuple[float, bytes]] = deque(maxlen=MAX_QUEUED_REPORTS)
+        self.ready = threading.Condition()
 
     @property
     def claimed(self) -> bool:
-        """True while a host has the interface."""
-        return self._owner is not None
+        """Whether a host has the interface."""
+        return self.owner is not None
 
     def connect(self) -> EmulatedLink:
         """Return a host's view of the device."""
@@ -89,17 +95,17 @@ class EmulatedUsb:
 
     def unplug(self) -> None:
         """Take the device from the bus; it keeps its power and its state."""
-        with self._ready:
+        with self.ready:
             self.present = False
             self.unplugged += 1
-            self._owner = None
-            self._ready.notify_all()
+            self.owner = None
+            self.ready.notify_all()
 
     def plug_in(self) -> None:
         """Put it back; hosts must open it anew."""
-        with self._ready:
+        with self.ready:
             self.device.forget_message()
-            self._replies.clear()
+            self.replies.clear()
             self.present = True
 
     def power_cycle(self) -> None:
@@ -108,100 +114,24 @@ class EmulatedUsb:
         self.device.power_cycle()
         self.plug_in()
 
-    def check_present(self, link: EmulatedLink) -> None:
-        """Raise ENODEV when the device is gone, or is not the one any more that was opened."""
-        if not self.present or link.unplugged != self.unplugged:
-            _fail(errno.ENODEV)
-
-    def claim(self, link: EmulatedLink) -> None:
-        """Give the interface to a host; EBUSY when another has it."""
-        faults = self.device.faults
-        with self._ready:
-            if not self.present:
-                _fail(errno.ENODEV)
-            if faults.kernel_driver or faults.taken or self._owner not in (None, link):
-                _fail(errno.EBUSY)
-            self._owner = link
-            self.device.forget_message()
-
-    def release(self, link: EmulatedLink) -> None:
-        """Take the interface back."""
-        with self._ready:
-            if self._owner is link:
-                self._owner = None
-
-    def transfer_out(self, link: EmulatedLink, report: bytes) -> None:
-        """Carry a report to the device and queue what it answers.
-
-        Parameters
-        ----------
-        link : EmulatedLink
-            The host, which must have claimed the interface.
-        report : bytes
-            See `HidDevice.receive`.
-        """
-        self._check_transfer(link)
-        replies = self.device.receive(report)
-        if replies:  # the controller has one buffer for answers: what was not read is gone
-            now_s = time.monotonic()
-            with self._ready:
-                late = [entry for entry in self._replies if entry[0] > now_s]
-                self._replies = deque(late, maxlen=MAX_QUEUED_REPORTS)
-        for reply in replies:
-            self._queue(reply)
-
-    def _check_transfer(self, link: EmulatedLink) -> None:
-        self.check_present(link)
-        if self._owner is not link:
-            _fail(errno.ENODEV)
-        if self.device.faults.take("stalls"):
-            _fail(errno.EPIPE)
-
-    def _queue(self, reply: bytes) -> None:
+    def queue(self, reply: bytes) -> None:
+        """Make a reply readable, as its faults allow."""
         faults = self.device.faults
         if faults.take("lose_replies"):
             return
         ready_s = time.monotonic()
         if faults.take("late_replies"):
             ready_s += faults.late_s
-        with self._ready:
+        with self.ready:
             if faults.take("stale_replies"):
                 old = bytes([reply[0], (reply[1] - 1) & 0xFF])
-                self._replies.append((ready_s, (old + reply[2:4] + b"\xff" * 60)))
+                self.replies.append((ready_s, (old + reply[2:4] + b"\xff" * 60)))
             if faults.take("empty_replies"):
                 reply = reply[:2] + bytes(len(reply) - 2)
             if faults.take("short_replies"):
                 reply = reply[:SHORT_REPORT_BYTES]
-            self._replies.append((ready_s, reply))
-            self._ready.notify_all()
-
-    def transfer_in(self, link: EmulatedLink, size: int, timeout_ms: int) -> bytes:
-        """Wait for a report from the device.
-
-        Parameters
-        ----------
-        link : EmulatedLink
-            The host, which must have claimed the interface.
-        size : int
-            Most bytes to return.
-        timeout_ms : int
-            Longest wait, milliseconds.
-        """
-        self._check_transfer(link)
-        deadline_s = time.monotonic() + timeout_ms / 1000
-        with self._ready:
-            while True:
-                if self._owner is not link:
-                    _fail(errno.ENODEV)
-                now_s = time.monotonic()
-                report = next((r for r in self._replies if r[0] <= now_s), None)
-                if report is not None:
-                    self._replies.remove(report)
-                    return report[1][:size]
-                if now_s >= deadline_s:
-                    _fail(errno.ETIMEDOUT)
-                wake_s = min([deadline_s, *(r[0] for r in self._replies)])
-                self._ready.wait(max(wake_s - now_s, 1e-4))
+            self.replies.append((ready_s, reply))
+            self.ready.notify_all()
 
 
 class EmulatedLink:
@@ -215,7 +145,19 @@ class EmulatedLink:
 
     def __init__(self, bus: EmulatedUsb) -> None:
         self._bus = bus
-        self.unplugged = bus.unplugged
+        self._unplugged = bus.unplugged
+
+    def _check_present(self) -> None:
+        """ENODEV when the device is gone, or was plugged in again since it was opened."""
+        if not self._bus.present or self._unplugged != self._bus.unplugged:
+            _fail(errno.ENODEV)
+
+    def _check_transfer(self) -> None:
+        self._check_present()
+        if self._bus.owner is not self:
+            _fail(errno.ENODEV)
+        if self._bus.device.faults.take("stalls"):
+            _fail(errno.EPIPE)
 
     def describe(self) -> UsbIdentity:
         """See `UsbLink`."""
@@ -225,25 +167,57 @@ class EmulatedLink:
 
     def claim(self) -> None:
         """See `UsbLink`."""
-        self.unplugged = self._bus.unplugged
-        self._bus.claim(self)
+        bus, faults = self._bus, self._bus.device.faults
+        with bus.ready:
+            self._unplugged = bus.unplugged
+            self._check_present()
+            if faults.kernel_driver or faults.taken or bus.owner not in (None, self):
+                _fail(errno.EBUSY)
+            bus.owner = self
+            bus.device.forget_message()
 
     def release(self) -> None:
         """See `UsbLink`."""
-        self._bus.release(self)
+        with self._bus.ready:
+            if self._bus.owner is self:
+                self._bus.owner = None
 
     def write(self, endpoint: int, report: bytes, timeout_ms: int) -> int:
         """See `UsbLink`."""
-        self._bus.transfer_out(self, report)
+        self._check_transfer()
+        bus = self._bus
+        replies = bus.device.receive(report)
+        if replies:  # the controller has one buffer for answers: what was not read is gone
+            now_s = time.monotonic()
+            with bus.ready:
+                late = [entry for entry in bus.replies if entry[0] > now_s]
+                bus.replies.clear()
+                bus.replies.extend(late)
+        for reply in replies:
+            bus.queue(reply)
         return len(report)
 
     def read(self, endpoint: int, size: int, timeout_ms: int) -> bytes:
         """See `UsbLink`."""
-        return self._bus.transfer_in(self, size, timeout_ms)
+        self._check_transfer()
+        bus, deadline_s = self._bus, time.monotonic() + timeout_ms / 1000
+        with bus.ready:
+            while True:
+                if bus.owner is not self:
+                    _fail(errno.ENODEV)
+                now_s = time.monotonic()
+                report = next((r for r in bus.replies if r[0] <= now_s), None)
+                if report is not None:
+                    bus.replies.remove(report)
+                    return report[1][:size]
+                if now_s >= deadline_s:
+                    _fail(errno.ETIMEDOUT)
+                wake_s = min([deadline_s, *(r[0] for r in bus.replies)])
+                bus.ready.wait(max(wake_s - now_s, 1e-4))
 
     def clear_halt(self, endpoint: int) -> None:
         """See `UsbLink`."""
-        self._bus.check_present(self)
+        self._check_present()
 
     def kernel_driver_active(self) -> bool:
         """See `UsbLink`."""

@@ -32,6 +32,7 @@ from sl_bench.dlpc.usb_server import EmulatedUsb, UsbSocketServer
 from sl_bench.process.bench_control import ControlServer
 from sl_bench.process.bench_settings import BenchSettings, read_settings
 from sl_bench.stage.grbl_emulator import GrblEmulator
+from sl_bench.world.mounting import Mounting
 from sl_bench.world.surfaces import make_surface
 from sl_bench.world.true_rig import rig_document, write_rig
 from sl_bench.world.world import World
@@ -63,17 +64,20 @@ class Bench:
     def __init__(self, settings: BenchSettings, runtime_dir: str | Path) -> None:
         self._dir = Path(runtime_dir)
         self._dir.mkdir(parents=True, exist_ok=True)
-        self._mounting = settings.make_mounting()
+        self._mounting = Mounting(
+            settings.stage_scale,
+            settings.stage_squareness_rad,
+            settings.plate_tilt_rad,
+            settings.part_offset_m,
+        )
         self._lamp = 1.0
         rig = settings.make_rig()
-        self.world = World(
-            rig, settings.make_surface(), settings.make_optics(), settings.make_finish()
-        )
+        surface = make_surface(settings.surface, **settings.surface_parameters)
+        self.world = World(rig, surface, settings.make_optics(), settings.finish)
         self.dmd = Dlpc900Emulator(settings.make_model(rig))
         self.usb = EmulatedUsb(self.dmd)
-        travel_mm = [travel * 1e3 for travel in settings.stage_travel_m]
         self.stage = GrblEmulator(
-            {130 + axis: travel for axis, travel in enumerate(travel_mm)},
+            {130 + axis: travel * 1e3 for axis, travel in enumerate(settings.stage_travel_m)},
             homed=settings.stage_homed,
             seed=settings.seed,
         )
@@ -234,12 +238,8 @@ class Bench:
         self.camera.faults = CameraFaults()
         self._fault_packets(0.0, True)
         self._fault_dmd({name: getattr(DlpcFaults(), name) for name in DMD_FAULTS})
-        self.stage.open_switches()
-        self.stage.jam(False)
-        self.stage.fall_silent(False)
-        self.stage.lose_replies(0)
-        self.stage.delay_replies(0, 0.0)
-        self.stage.lose_steps(0.0)
+        self._fault_stage({"open_switches": None, "jam": False, "fall_silent": False})
+        self._fault_stage({"lose_replies": 0, "delay_replies": [0, 0.0], "lose_steps": 0.0})
         self.stage.remove_switches()
 
     def _fault_camera(self, faults: dict[str, Any]) -> None:

@@ -7,10 +7,9 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from sl_bench.world.mounting import Mounting, Triple
-from sl_bench.world.optics import Finish, Optics, check_ranges, make_finish
+from sl_bench.world.mounting import Triple
+from sl_bench.world.optics import Optics, check_ranges
 from sl_bench.world.reference_rig import reference_rig
-from sl_bench.world.surfaces import Surface, make_surface
 from sl_bench.world.true_rig import read_rig
 from sl_common.documents import (
     Fields,
@@ -98,14 +97,6 @@ class BenchSettings:
         """
         return reference_rig() if self.rig == "reference" else read_rig(self.rig)
 
-    def make_surface(self) -> Surface:
-        """Return the part."""
-        return make_surface(self.surface, **self.surface_parameters)
-
-    def make_finish(self) -> Finish:
-        """Return the part's finish."""
-        return make_finish(self.finish)
-
     def make_optics(self) -> Optics:
         """Return light, blur and sensor."""
         try:
@@ -122,12 +113,6 @@ class BenchSettings:
                 f"{rig.projector.image_size}; expected the same"
             )
         return model
-
-    def make_mounting(self) -> Mounting:
-        """Return what the stage does to the part."""
-        return Mounting(
-            self.stage_scale, self.stage_squareness_rad, self.plate_tilt_rad, self.part_offset_m
-        )
 
 
 _DEFAULTS: dict[str, Any] = {

@@ -59,7 +59,6 @@ class GrblFirmware:
         """Come up after power-on or reset, with the banner."""
         self._rx = bytearray()
         self._line = bytearray()
-        self._overflow = False
         self._pending: Callable[[], bool] | None = None
         self._critical = self._alarm_when_halted = False
         self._owes_ok = False

@@ -59,20 +59,13 @@ class Modes:
 
 @dataclass(frozen=True)
 class GcodeCommand:
-    """What a line asks for, after the modes have been updated.
+    """What a line asks for, after the modes have been updated."""
 
-    Parameters
-    ----------
-    target : list of float or None
-        Machine position to go to, mm.
-    feed : float
-        mm/min; 0 for a rapid move.
-    dwell_s : float or None
-        ``G4``.
-    """
-
+    #: Machine position to go to, mm.
     target: list[float] | None = None
+    #: mm/min; 0 for a rapid move.
     feed: float = 0.0
+    #: ``G4``.
     dwell_s: float | None = None
 
 

@@ -67,21 +67,14 @@ class Braking:
 
 @dataclass(frozen=True)
 class Block:
-    """A line in the planner.
+    """A line in the planner."""
 
-    Parameters
-    ----------
-    start, target : tuple of float
-        Machine position, mm.
-    speed : float
-        Programmed speed, mm/s; infinite for a rapid move.
-    is_jog : bool
-        It came from ``$J=``.
-    """
-
+    #: Machine position, mm.
     start: Triple
     target: Triple
+    #: Programmed speed, mm/s; infinite for a rapid move.
     speed: float
+    #: It came from ``$J=``.
     is_jog: bool
 
     @property
@@ -113,24 +106,16 @@ class Block:
 
 @dataclass(frozen=True)
 class HomingLeg:
-    """One leg of a homing cycle: every axis at its own constant rate, or a pause.
+    """One leg of a homing cycle: every axis at its own constant rate, or a pause."""
 
-    Parameters
-    ----------
-    start, target : tuple of float
-        Place of the carriage, mm.
-    rate : float
-        mm/s of each axis that moves.
-    pause_s : float
-        Debounce time after the leg.
-    alarm : int
-        Alarm that the leg ends in; 0 for none.
-    """
-
+    #: Place of the carriage, mm.
     start: Triple
     target: Triple
+    #: mm/s of each axis that moves.
     rate: float
+    #: Debounce time after the leg.
     pause_s: float
+    #: Alarm that the leg ends in; 0 for none.
     alarm: int = 0
 
     @property

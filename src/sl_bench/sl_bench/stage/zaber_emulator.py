@@ -25,12 +25,10 @@ class ZaberDevice:
     ----------
     address, axis : int
         The device's place in the chain, and which of its axes this is.
-    limit_max : int
-        Reach: 0 to this.
-    position : int
-        Where the carriage stands at the start.
+    limit_max, position : int
+        Reach, from 0 on, and where the carriage stands at the start.
     referenced : bool
-        Whether it knows.
+        Whether the axis knows its position.
     """
 
     def __init__(
