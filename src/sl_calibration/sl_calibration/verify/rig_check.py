@@ -21,6 +21,7 @@ from sl_calibration.solve.ray_midpoints import triangulate
 from sl_calibration.target.plate import Plate
 from sl_common.errors import CalibrationError
 from sl_projector.sequence.stack import Stack
+from sl_reconstruct.cloud.plane_fit import Plane, fit_plane
 from sl_reconstruct.model.calibration_file import Calibration
 from sl_reconstruct.model.rig import Rig
 
@@ -110,7 +111,7 @@ class Findings:
 
     @property
     def figures(self) -> dict[str, float]:
-        """Figures that `VerifyLimits` limits, by the same names; NaN where one cannot be told."""
+        """Figures that `VerifyLimits` limits, by the same names; NaN where one is not known."""
         worst = {
             name: _worst([getattr(check, name) for check in self.checks])
             for name in ("flatness_m", "ray_gap_m", "lattice_m", "pitch_error")
@@ -252,12 +253,14 @@ def check_on(
         Camera pixels and places on the plate (metres) of its holes; None for a flat.
     """
     points, gaps = triangulate(rig, *targets)
-    plane = _plane(points)
+    plane = fit_plane(points, rounds=1)
+    if plane is None:
+        raise CalibrationError(f"{len(points)} points that lie in no plane; expected a flat")
     lattice = _lattice(rig, plane, *holes) if holes else (float("nan"), float("nan"))
-    middle, normal = plane
-    off = np.asarray((points - middle) @ normal)
+    off = plane.distances_m(points)
+    figures = (_rms(off), _rms(gaps), *lattice)
     target = "plate" if holes else "flat"
-    return Check(target, height_m, _rms(off), _rms(gaps), *lattice, middle, normal, points, off)
+    return Check(target, height_m, *figures, plane.point_m, plane.normal, points, off)
 
 
 def check_target(target: str) -> None:
@@ -266,24 +269,14 @@ def check_target(target: str) -> None:
         raise CalibrationError(f"target={target!r}; expected one of {TARGETS}")
 
 
-def _plane(points: Array) -> tuple[Array, Array]:
-    """A point and the unit normal, upwards, of the best plane."""
-    middle = points.mean(axis=0)
-    normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
-    return middle, normal if normal[2] > 0 else -normal
-
-
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _lattice(
-    rig: Rig, plane: tuple[Array, Array], centres_px: Array, plate_xy_m: Array
-) -> tuple[float, float]:
+def _lattice(rig: Rig, plane: Plane, centres_px: Array, plate_xy_m: Array) -> tuple[float, float]:
     """Distance of holes from the plate's lattice, rms, and measured pitch over nominal, less 1."""
-    middle, normal = plane
     origin, rays = rig.camera.position_m, rig.camera.rays(centres_px)
-    depth = ((middle - origin) @ normal) / (rays @ normal)
+    depth = ((plane.point_m - origin) @ plane.normal) / (rays @ plane.normal)
     holes = origin + depth[:, np.newaxis] * rays
     model = np.pad(plate_xy_m, ((0, 0), (0, 1)))
     p, q = holes - holes.mean(axis=0), model - model.mean(axis=0)

@@ -41,13 +41,15 @@ class Plane:
         return np.asarray((xyz_m - self.point_m) @ self.normal)
 
 
-def fit_plane(xyz_m: Array) -> Plane | None:
+def fit_plane(xyz_m: Array, rounds: int = ROUNDS) -> Plane | None:
     """Fit a plane to points.
 
     Parameters
     ----------
     xyz_m : ndarray, (n, 3)
         Points, metres; those with NaN are left out.
+    rounds : int
+        Fits at the most, each without the outliers of the one before; 1: to all points.
 
     Returns
     -------
@@ -57,7 +59,7 @@ def fit_plane(xyz_m: Array) -> Plane | None:
     points = np.asarray(xyz_m, dtype=np.float64)
     points = points[np.isfinite(points).all(axis=1)]
     kept = points
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         plane = _fit(kept, len(points))
         if plane is None:
             return None
