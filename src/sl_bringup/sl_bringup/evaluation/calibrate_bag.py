@@ -19,7 +19,7 @@ from sl_calibration.data.run_store import OBSERVATIONS
 from sl_calibration.data.session import CalibrationRequest
 from sl_calibration.data.view_extraction import observe
 from sl_calibration.solve.acceptance import Limits
-from sl_calibration.target.plate import DEFAULT_PLATE, Plate
+from sl_calibration.target.plate import DEFAULT_PLATE
 from sl_calibration.workflow.conclusion import Outcome, conclude
 from sl_calibration.workflow.run_record import Pitches, RunRecord, made_from_request
 from sl_camera.sync.match_events import Status
@@ -33,11 +33,7 @@ Tell = Callable[[str], None]
 
 
 def solve_recorded(
-    path: Path,
-    output: Path,
-    plate: Plate = DEFAULT_PLATE,
-    look: Look = observe,
-    tell: Tell = lambda _: None,
+    path: Path, output: Path, look: Look = observe, tell: Tell = lambda _: None
 ) -> tuple[Outcome, list[str]]:
     """Solve the last calibration in a recording again; nothing is put in force.
 
@@ -47,8 +43,6 @@ def solve_recorded(
         The recording.
     output : Path
         For observations, calibration and report.
-    plate : Plate
-        Where the recording does not say what plate it was.
     look : callable
         Makes a view of a stack.
     tell : callable
@@ -69,7 +63,7 @@ def solve_recorded(
         When it holds no calibration, not all its stacks, or they do not determine a rig.
     """
     with open_bag(path) as bag:
-        run = _recorded_run(bag) or _assumed(plate)
+        run = _recorded_run(bag) or _assumed()
         observations = _observations(bag, run, look, tell)
         notes = list(bag.lost)
     output.mkdir(parents=True, exist_ok=True)
@@ -80,9 +74,8 @@ def solve_recorded(
 
 def _recorded_run(bag: Bag) -> RunRecord | None:
     """Last run that the calibration's node published; None where there is none."""
-    if not bag.has(CALIBRATION_RUN):
-        return None
-    texts = [recorded.message.data for recorded in bag.messages(CALIBRATION_RUN, quick=True)]
+    found = bag.messages(CALIBRATION_RUN, quick=True) if bag.has(CALIBRATION_RUN) else ()
+    texts = [recorded.message.data for recorded in found]
     if not texts:
         return None
     try:
@@ -91,14 +84,14 @@ def _recorded_run(bag: Bag) -> RunRecord | None:
         return run
     except (ValueError, TypeError, KeyError) as error:
         raise CalibrationError(
-            f"{bag.path}: what {CALIBRATION_RUN.name} tells cannot be used ({error!r}); expected "
-            "what the calibration's node publishes"
+            f"{bag.path}: {CALIBRATION_RUN.name} cannot be used ({error!r}); expected what the "
+            "calibration's node publishes"
         ) from error
 
 
-def _assumed(plate: Plate) -> RunRecord:
-    """Run of a recording that tells of none: everything in it that shows both coordinates."""
-    request = CalibrationRequest("both", (0.0,), plate, "precise-rows", least=1)
+def _assumed() -> RunRecord:
+    """Run of a recording without one: the default plate in every stack with both coordinates."""
+    request = CalibrationRequest("both", (0.0,), DEFAULT_PLATE, "precise-rows", least=1)
     made_from = {**made_from_request(request), "heights_m": []}
     return RunRecord((), made_from, Pitches(1e-5, 1e-5), Limits())
 

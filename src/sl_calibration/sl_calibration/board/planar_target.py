@@ -1,6 +1,6 @@
 """Devices from a flat target in free poses, OpenCV's way: the lens model of Brown and Conrady.
 
-For rigs without a stage: a board or dot plate in three or more unlike poses. The paper's model
+For rigs without a stage: a board or dot plate in three or more different poses. The paper's model
 and the stage's knowledge are in `sl_calibration.solve.solution`; here OpenCV does the work.
 """
 
@@ -133,15 +133,15 @@ def solve_free_pair(
     camera = solve_free(points_m, camera_px, sensors[0], coefficients)
     projector = solve_free(points_m, projector_px, sensors[1], coefficients)
     flat, seen = _checked(points_m, camera_px)
-    _, thrown = _checked(points_m, projector_px)
+    _, lit = _checked(points_m, projector_px)
     lenses = (*opencv_lens(camera.device), *opencv_lens(projector.device), sensors[0].image_size)
     flags = _flags(coefficients) | cv2.CALIB_USE_INTRINSIC_GUESS
-    points = (flat, seen, thrown)
+    points = (flat, seen, lit)
     found = _opencv(cv2.stereoCalibrate, *points, *lenses, flags=flags, criteria=_STOP)
     rms_px, k1, d1, k2, d2, rotation, translation, *_ = found
-    thrower = _device(k2, d2, sensors[1])
-    thrower = replace(thrower, rotation=rotation, translation_m=np.ravel(translation))
-    return FreePair(camera, projector, Rig(_device(k1, d1, sensors[0]), thrower), float(rms_px))
+    projected = _device(k2, d2, sensors[1])
+    projected = replace(projected, rotation=rotation, translation_m=np.ravel(translation))
+    return FreePair(camera, projector, Rig(_device(k1, d1, sensors[0]), projected), float(rms_px))
 
 
 def _flags(coefficients: int) -> int:
@@ -160,7 +160,7 @@ def _checked(
     if len(shapes) < MIN_VIEWS or min(p[0] for p, _ in shapes) < MIN_POINTS:
         raise CalibrationError(
             f"{[p[0] for p, _ in shapes]} points in {len(shapes)} views; expected at least "
-            f"{MIN_POINTS} in each of {MIN_VIEWS} views of the target in unlike poses"
+            f"{MIN_POINTS} in each of {MIN_VIEWS} views of the target in different poses"
         )
     flat = [np.pad(np.asarray(p), ((0, 0), (0, 1))).astype(np.float32) for p in points_m]
     return flat, [np.asarray(q).astype(np.float32) for q in pixels]
@@ -172,10 +172,10 @@ def _opencv(function: Any, *arguments: Any, **options: Any) -> Any:
     except cv2.error as error:
         raise CalibrationError(
             f"OpenCV finds no solution ({str(error).strip().splitlines()[-1]}); expected a flat "
-            "target in unlike poses"
+            "target in different poses"
         ) from None
     if not np.isfinite(found[0]):
-        raise CalibrationError("OpenCV's solution is not finite; expected unlike poses")
+        raise CalibrationError("OpenCV's solution is not finite; expected different poses")
     return found
 
 

@@ -1,7 +1,7 @@
 """What a calibration is solved from, kept so that it can be solved again.
 
 Nothing here is a result: plate coordinates that were given, pixels that were measured, heights
-that the stage told.
+that the stage reported.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class View:
     Parameters
     ----------
     height_m : float
-        Stage z, as the stage tells it, metres.
+        Stage z, as the stage reports it, metres.
     hole_ids : ndarray, (N, 2), int
         Column and row of each hole on the plate.
     plate_xy_m : ndarray, (N, 2)
@@ -52,7 +52,7 @@ class View:
     edge_sigma_px : float
         1-sigma of a single edge on this plate in this light, camera pixels.
     xy_m : tuple of float
-        Stage x and y, as the stage tells them, metres.
+        Stage x and y, as the stage reports them, metres.
 
     Raises
     ------

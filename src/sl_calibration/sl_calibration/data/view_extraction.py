@@ -27,13 +27,14 @@ MIN_LIGHT = 0.05
 MIN_LIT_PART = 0.02
 #: Fewer targets than this in a view do not carry a projector's calibration.
 MIN_TARGETS = 30
-#: Light with a relative slope g moves an edge blurred by s by some s^2 g, alike over whole regions
-#: of the field: that does not average out, so each of the hundreds of targets has to count for less
-#: to make up for it. 1.5 px^2 as measured on noise-free images, times the root of 50 a region.
+#: Light with a relative slope g moves an edge blurred by s by about s^2 g, the same over whole
+#: regions of the field. That does not average out, so each of the hundreds of targets has to count
+#: for less to make up for it. 1.5 px^2, as measured on noise-free images, times the root of 50 a
+#: region.
 LIGHT_SLOPE_PX2 = 10.0
 #: What the slant of the views does to edges in even light, DMD pixels: 6e-5, alike everywhere.
 MODEL_SIGMA_PX = 0.0009
-#: The light is looked at in cells of so many pixels, smoothed over so many cells.
+#: The light is averaged in cells of this many pixels, and smoothed over this many cells.
 CELL_PX = 8
 SMOOTH_CELLS = 6.0
 _NO_TARGETS = Correspondences(*np.empty((3, 0, 2)))

@@ -1,6 +1,6 @@
 """One device calibrated, the other with its lens fixed: as an earlier calibration has it.
 
-Only the lens (f, C, kappa) can be fixed. Where both devices stand is measured anew: the plate,
+Only the lens (f, C, kappa) can be fixed. Where both devices stand is measured again: the plate,
 which is the world, need not lie where it lay before.
 """
 

@@ -65,7 +65,7 @@ def search_centre(points_m: Array, pixels: Array, sensor: Sensor) -> CentreSearc
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):
         raise CalibrationError(
-            f"the linear step fits no device to {len(points_m)} points, wherever the image centre; "
+            f"the linear step fits no device to {len(points_m)} points, whatever the image centre; "
             "expected non-coplanar points seen from above (are the heights' signs right?)"
         )
     simplex = grid[best] + 0.15 * size.min() * np.array([[0, 0], [1, 0], [0, 1]])

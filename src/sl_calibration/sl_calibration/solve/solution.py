@@ -76,7 +76,7 @@ class Solution:
 
     @property
     def figures(self) -> dict[str, float]:
-        """Figures that `Limits` limits, by the same names, as far as this solution has them."""
+        """Figures that `Limits` limits, by the same names; those that this solution has."""
         bundle = self.bundle
         problem, stage = bundle.problem, bundle.stage
         rejected = [1 - float(np.mean(bundle.used[g])) for g in problem.groups if g.stop > g.start]

@@ -263,13 +263,13 @@ class Calibrator:
 
     def _judged(self, findings: Findings, calibration_hash: str) -> VerifyOutcome:
         limits = self._verify_limits
-        told = {name: value for name, value in findings.figures.items() if np.isfinite(value)}
-        verdict = judge(told, limits)
+        known = {name: value for name, value in findings.figures.items() if np.isfinite(value)}
+        verdict = judge(known, limits)
         reasons = f" ({'; '.join(verdict.reasons)})" if verdict.reasons else ""
         advice = "the calibration in force is good" if verdict.passed else f"recalibrate{reasons}"
         target, count = findings.checks[0].target, len(findings.checks)
         message = (
-            f"{told['rms_m'] * 1e6:.3f} um rms on the {target} at {count} "
+            f"{known['rms_m'] * 1e6:.3f} um rms on the {target} at {count} "
             f"height{'s' * (count > 1)} (limit {limits.rms_m * 1e6:g} um): {advice}; "
             f"{findings.words}"
         )

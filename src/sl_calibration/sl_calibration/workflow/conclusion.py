@@ -130,8 +130,8 @@ def _message(solved: JudgedSolution) -> str:
     if kept := solved.observations.made_from.get("kept"):
         text += (
             f"; the {kept['name']} keeps its lens of {kept['source']}, "
-            f"{figures['kept_lens_sigmas']:.1f} sigma from what this run finds; where it stands "
-            "was measured anew"
+            f"{figures['kept_lens_sigmas']:.1f} sigma from what this run finds; its "
+            "position was measured again"
         )
     return text
 

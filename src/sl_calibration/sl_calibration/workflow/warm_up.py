@@ -1,4 +1,4 @@
-"""Compile beforehand what the first calibration would wait for, in a process apart.
+"""Compile what the first calibration would wait for, in a process of its own.
 
 The compiler leaves much memory behind in the process that it ran in; numba's cache on disk is
 shared, so the node starts this module as a process of its own.
@@ -22,7 +22,7 @@ _NICENESS = 10
 
 def warm_up() -> None:
     """Find a drawn plate, and decode a stack without anything in it."""
-    # Imported late: where all is compiled the process ends without a second of imports.
+    # Imported late: if everything is compiled, the process ends without a second of imports.
     import numpy as np
 
     from sl_calibration.target.hole_detection import find_plate
@@ -42,7 +42,7 @@ def warm_up() -> None:
 
 
 def warm_up_apart() -> subprocess.Popen[bytes]:
-    """Start another process that does `warm_up`, into numba's cache."""
+    """Start another process that runs `warm_up` and fills numba's cache."""
     return subprocess.Popen(
         [sys.executable, "-m", "sl_calibration.workflow.warm_up"],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
