@@ -9,18 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from sl_bringup.cli.main import COMMANDS, build_parser, main
+from sl_bringup.cli.main import COMMANDS, build_parser, main, module_of
 from support.patience import patience
 
 OFFLINE = ("patterns", "import", "evaluate")
 
 
 def written(command: str) -> bool:
-    module = {name: module for name, module, _ in COMMANDS}[command]
-    return importlib.util.find_spec(module) is not None
+    return importlib.util.find_spec(module_of(command)) is not None
 
 
-@pytest.mark.parametrize("command", [name for name, _, _ in COMMANDS])
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_with_examples(
     command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -39,7 +38,7 @@ def test_overview_names_every_command(capsys: pytest.CaptureFixture[str]) -> Non
         main(["--help"])
     assert left.value.code == 0
     text = capsys.readouterr().out
-    for name, _, line in COMMANDS:
+    for name, line in COMMANDS.items():
         assert name in text
         assert line in text
 

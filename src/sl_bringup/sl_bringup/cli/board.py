@@ -21,7 +21,6 @@ def add_parser(subparsers: Any) -> None:
     """Register ``slrig board``."""
     parser = subparsers.add_parser(
         "board",
-        help="calibrate from a chessboard held anyhow",
         description="Calibrate camera and projector, without plate and stage, from a recording of "
         "Gray code (columns and rows, every pattern with its inverse) on a chessboard in three or "
         "more poses. The lenses are OpenCV's (k1, k2); the camera's frame is the world. Corners "
@@ -30,31 +29,18 @@ def add_parser(subparsers: Any) -> None:
         "  slrig import board --sequence examples/procam_board.yaml --output board_bag\n"
         "  slrig board board_bag --corners 9x7 --square-mm 75 --output rig.yaml\n"
         "  slrig evaluate board_bag --calibration rig.yaml --output results",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 directory, .mcap or .db3")
-    parser.add_argument(
-        "--corners", required=True, type=_corners, metavar="CxR", help="inner corners, as 9x7"
-    )
-    parser.add_argument("--square-mm", required=True, type=float, help="side of a square")
-    parser.add_argument("--output", required=True, type=Path, metavar="FILE", help="calibration")
-    parser.add_argument(
-        "--coefficients",
-        type=int,
-        choices=(0, 2, 4, 5),
-        default=2,
-        help="of each lens: none; k1, k2; with p1, p2; with k3 (default: 2)",
-    )
-    parser.add_argument(
-        "--pitch-um",
-        type=float,
-        nargs=2,
-        default=(5.0, 10.0),
-        metavar=("CAMERA", "DMD"),
-        help="pixel pitches; they only turn pixels into millimetres in reports (default: 5 10)",
-    )
-    parser.add_argument("--namespace", help="namespace of the rig, where the bag has several")
-    parser.set_defaults(run=run)
+    add = parser.add_argument
+    add("bag", type=Path, metavar="BAG", help="rosbag2 directory, .mcap or .db3")
+    add("--corners", required=True, type=_corners, metavar="CxR", help="inner corners, as 9x7")
+    add("--square-mm", required=True, type=float, help="side of a square")
+    add("--output", required=True, type=Path, metavar="FILE", help="calibration")
+    text = "of each lens: none; k1, k2; with p1, p2; with k3 (default: 2)"
+    add("--coefficients", type=int, choices=(0, 2, 4, 5), default=2, help=text)
+    text = "pixel pitches; they only turn pixels into millimetres in reports (default: 5 10)"
+    pair = ("CAMERA", "DMD")
+    add("--pitch-um", type=float, nargs=2, default=(5.0, 10.0), metavar=pair, help=text)
+    add("--namespace", help="namespace of the rig, where the bag has several")
 
 
 def _corners(text: str) -> tuple[int, int]:

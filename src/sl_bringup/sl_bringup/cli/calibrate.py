@@ -9,10 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sl_bringup.cli.up import add_graph_arguments, graph_options, run_once
-from sl_bringup.graph.client_process import become_client
+from sl_bringup.cli.up import add_client_options, add_graph_arguments, graph_options, run_client
 from sl_bringup.graph.console import complain, say
-from sl_bringup.graph.graph import Graph, GraphOptions, client_command, is_running
+from sl_bringup.graph.graph import Graph, GraphOptions, client_command
 from sl_common.documents import read_document
 from sl_common.errors import ConfigError
 
@@ -26,7 +25,6 @@ def add_parser(subparsers: Any) -> None:
     """Register ``slrig calibrate``."""
     parser = subparsers.add_parser(
         "calibrate",
-        help="calibrate the rig on the hole plate",
         description="Ask the graph to calibrate: the plate at several heights, camera and "
         "projector, uncertainty, verdict, report. The exit status is 0 only when a calibration "
         "was accepted and is in force. With --from, a recording (slrig record, during the run) or "
@@ -41,70 +39,24 @@ def add_parser(subparsers: Any) -> None:
         "  slrig calibrate --from recorded_bag --output again\n"
         "  slrig calibrate --from calibrations/2026-01-31_120000_run --opencv rig.xml\n"
         "  slrig calibrate --up --bench --surface hole_plate",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "--from", dest="source", type=Path, metavar="RUN|BAG",
-        help="solve this run's folder, or the calibration in this recording, again, offline",
-    )  # fmt: skip
-    parser.add_argument("--output", type=Path, metavar="DIR", help="with --from: for the results")
-    parser.add_argument(
-        "--opencv", type=Path, metavar="FILE",
-        help="with --from: write the run's calibration for OpenCV (.xml, .yml, .json) instead",
-    )  # fmt: skip
-    parser.add_argument(
-        "--heights-mm", type=float, nargs="+", default=[], metavar="Z",
-        help="stage heights of the views (default: the node's), or to verify at",
-    )  # fmt: skip
-    parser.add_argument(
-        "--target",
-        choices=["both", "camera", "projector"],
-        default="both",
-        help="what to calibrate; one device alone: the other keeps its lens",
-    )
-    parser.add_argument(
-        "--keep", type=Path, metavar="FILE",
-        help="with --target: calibration whose other device is kept (default: the one in force)",
-    )  # fmt: skip
-    parser.add_argument("--sequence", default="", help="patterns, both axes (default: the node's)")
-    parser.add_argument(
-        "--verify", nargs="?", const="plate", choices=["plate", "flat"],
-        help="only check the calibration in force, on the plate or a flat (default: plate)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--timeout", type=float, default=600.0, metavar="S", help="for the run (default: 600)"
-    )
-    parser.add_argument(
-        "--up", action="store_true", help="start the graph for this run where none is running"
-    )
-    parser.add_argument(
-        "--ready-timeout", type=float, default=240.0, metavar="S",
-        help="with --up: for the graph to get ready, compiling apart (default: 240)",
-    )  # fmt: skip
+    add = parser.add_argument
+    text = "solve this run's folder, or the calibration in this recording, again, offline"
+    add("--from", dest="source", type=Path, metavar="RUN|BAG", help=text)
+    add("--output", type=Path, metavar="DIR", help="with --from: for the results")
+    text = "with --from: write the run's calibration for OpenCV (.xml, .yml, .json) instead"
+    add("--opencv", type=Path, metavar="FILE", help=text)
+    text = "stage heights of the views (default: the node's), or to verify at"
+    add("--heights-mm", type=float, nargs="+", default=[], metavar="Z", help=text)
+    text = "what to calibrate; one device alone: the other keeps its lens"
+    add("--target", choices=["both", "camera", "projector"], default="both", help=text)
+    text = "with --target: calibration whose other device is kept (default: the one in force)"
+    add("--keep", type=Path, metavar="FILE", help=text)
+    add("--sequence", default="", help="patterns, both axes (default: the node's)")
+    text = "only check the calibration in force, on the plate or a flat (default: plate)"
+    add("--verify", nargs="?", const="plate", choices=["plate", "flat"], help=text)
+    add_client_options(parser, 600.0)
     add_graph_arguments(parser)
-    parser.set_defaults(run=run)
-
-
-async def calibrate_once(args: argparse.Namespace, options: GraphOptions) -> int:
-    """Start a graph, calibrate, stop the graph; 0 only when all went well.
-
-    Parameters
-    ----------
-    args : Namespace
-        The command line.
-    options : GraphOptions
-        Domain, namespace and configuration.
-    """
-    log = options.directory / "graph.log"
-    with log.open("w") as file:
-
-        async def work(graph: Graph) -> int:
-            if not await graph.ready(args.ready_timeout):
-                return 1
-            return await graph.run_client(client_command(CLIENT, *args.words))
-
-        say(f"starting the graph{' on the bench' if options.bench else ''} (log: {log})")
-        return await run_once(options, lambda line: file.write(line + "\n"), work, "calibrate")
 
 
 async def calibrate_bench(graph: Graph, options: GraphOptions) -> int:
@@ -157,9 +109,7 @@ def run(args: argparse.Namespace) -> int:
     if args.opencv:
         raise ConfigError("--opencv writes a run's calibration; expected --from RUN beside it")
     options = graph_options(args)
-    if args.up and not is_running(options.directory):
-        return asyncio.run(calibrate_once(args, options))
-    return become_client(CLIENT, args.words, options.transport)
+    return run_client(CLIENT, args, options, options.directory / "graph.log")
 
 
 def solve_again(source: Path, output: Path | None) -> int:

@@ -101,7 +101,6 @@ def add_parser(subparsers: Any) -> None:
     """Register ``slrig evaluate``."""
     parser = subparsers.add_parser(
         "evaluate",
-        help="recordings to clouds, reports and pictures",
         description="Evaluate recordings without ROS: for each scan a folder with cloud.ply, "
         "cloud.pcd, height.tiff, height.png, report.json, report.html and pictures. Settings and "
         "calibration are the recording's unless others are named. The exit status is 0 only when "
@@ -113,56 +112,24 @@ def add_parser(subparsers: Any) -> None:
         "  slrig evaluate scan_bag --output cubic --set estimator=cubic\n"
         "  slrig evaluate scan_bag --output sweep --sweep estimator=matched,cubic\n"
         "  slrig evaluate foreign_bag --output results --set require_pose=false",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "bags", type=Path, nargs="+", metavar="BAG", help="rosbag2 directory, .mcap or .db3"
-    )
-    parser.add_argument(
-        "--calibration",
-        type=Path,
-        metavar="FILE",
-        help="use this one (YAML, or OpenCV's XML, YAML, JSON), not the bag's",
-    )
-    parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="for the results")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        dest="assignments",
-        help="change a setting of reconstruction or matching; may be repeated",
-    )
-    parser.add_argument(
-        "--sweep",
-        action="append",
-        default=[],
-        metavar="NAME=A,B,C",
-        help="evaluate with each of these values, and compare them in one table; may be repeated",
-    )
-    parser.add_argument("--namespace", help="namespace of the rig, where the bag has several")
-    parser.add_argument(
-        "--pictures",
-        choices=("none", "first", "all"),
-        default=None,
-        help="of which scans pictures are drawn; none: no pages either (default: all; with "
-        "--sweep: first)",
-    )
-    parser.add_argument(
-        "--no-pictures",
-        action="store_const",
-        const="none",
-        dest="pictures",
-        help="as --pictures none",
-    )
-    parser.add_argument(
-        "--jobs",
-        type=int,
-        default=len(os.sched_getaffinity(0)),
-        metavar="N",
-        help="scans evaluated at a time (default: one per core)",
-    )
-    parser.set_defaults(run=run)
+    add = parser.add_argument
+    add("bags", type=Path, nargs="+", metavar="BAG", help="rosbag2 directory, .mcap or .db3")
+    text = "use this one (YAML, or OpenCV's XML, YAML, JSON), not the bag's"
+    add("--calibration", type=Path, metavar="FILE", help=text)
+    add("--output", required=True, type=Path, metavar="DIR", help="for the results")
+    several = {"action": "append", "default": []}
+    text = "change a setting of reconstruction or matching; may be repeated"
+    add("--set", dest="assignments", metavar="NAME=VALUE", help=text, **several)
+    text = "evaluate with each of these values, and compare them in one table; may be repeated"
+    add("--sweep", metavar="NAME=A,B,C", help=text, **several)
+    add("--namespace", help="namespace of the rig, where the bag has several")
+    text = "of which scans there are pictures; none: no pages either (default: all; --sweep: first)"
+    add("--pictures", choices=("none", "first", "all"), help=text)
+    text = "as --pictures none"
+    add("--no-pictures", action="store_const", const="none", dest="pictures", help=text)
+    text = "scans evaluated at a time (default: one per core)"
+    add("--jobs", type=int, default=len(os.sched_getaffinity(0)), metavar="N", help=text)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -61,7 +61,6 @@ def add_parser(subparsers: Any) -> None:
     """Register ``slrig measure``."""
     parser = subparsers.add_parser(
         "measure",
-        help="measure a cloud or height map",
         description="Measure features of a cloud or height map, each with its standard "
         "uncertainty. Regions are in millimetres, as the axes of the pictures: X0,Y0,X1,Y1 or "
         "the corners of a polygon. Write --plane=-1,-1,1,1 where the first number is negative.",
@@ -70,55 +69,31 @@ def add_parser(subparsers: Any) -> None:
         "  slrig measure cloud.pcd --angle=-2.5,-3,-0.5,3,0.5,-3,2.5,3 --json angle.json\n"
         "  slrig measure cloud.pcd --profile=-5,0,5,0,0.1 --csv section.csv\n"
         "exit status: 0 only when everything was measured and lies within its tolerance",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "cloud",
-        type=Path,
-        metavar="CLOUD|TIFF",
-        help="cloud.pcd, cloud.ply, or height.tiff with its report.json",
-    )
+    add = parser.add_argument
+    text = "cloud.pcd, cloud.ply, or height.tiff with its report.json"
+    add("cloud", type=Path, metavar="CLOUD|TIFF", help=text)
     for name, feature in FEATURES.items():
         if feature.metavar:
-            parser.add_argument(
-                f"--{name}", type=numbers_of, metavar=feature.metavar, help=feature.help
-            )
+            add(f"--{name}", type=numbers_of, metavar=feature.metavar, help=feature.help)
         else:
-            parser.add_argument(f"--{name}", action="store_const", const=(), help=feature.help)
-    parser.add_argument(
-        "--reference",
-        type=Path,
-        metavar="TIFF",
-        help="compare with this height map (report.json beside it)",
+            add(f"--{name}", action="store_const", const=(), help=feature.help)
+    text = "compare with this height map (report.json beside it)"
+    add("--reference", type=Path, metavar="TIFF", help=text)
+    add("--level", action="store_true", help="take offset and tilt out of the comparison")
+    text = "limits of the value, in its unit as printed; one measurement only"
+    add("--tolerance", type=tolerance_of, metavar="LOW:HIGH", help=text)
+    text = (
+        "what the tolerance is for, as --json names it: Sa, centre_x, a, ... (default: the value); "
+        "lengths in mm of sphere, cylinder and hole, else in µm"
     )
-    parser.add_argument(
-        "--level", action="store_true", help="take offset and tilt out of the comparison"
-    )
-    parser.add_argument(
-        "--tolerance",
-        type=tolerance_of,
-        metavar="LOW:HIGH",
-        help="limits of the value, in the unit in which it is told; one measurement only",
-    )
-    parser.add_argument(
-        "--quantity",
-        metavar="NAME",
-        help="what the tolerance is for, as --json names it: Sa, centre_x, a, ... (default: the "
-        "value); lengths in mm of sphere, cylinder and hole, else in µm",
-    )
-    parser.add_argument(
-        "--region", type=numbers_of, metavar=RECTANGLE, help="where to compare (default: all over)"
-    )
-    parser.add_argument(
-        "--picture",
-        type=Path,
-        metavar="PNG",
-        help="draw the section with its uncertainty, or the map of deviations",
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all results")
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="write the section's points")
-    parser.add_argument("--x3p", type=Path, metavar="FILE", help="write the height map as X3P")
-    parser.set_defaults(run=run)
+    add("--quantity", metavar="NAME", help=text)
+    add("--region", type=numbers_of, metavar=RECTANGLE, help="where to compare (default: all over)")
+    text = "draw the section with its uncertainty, or the map of deviations"
+    add("--picture", type=Path, metavar="PNG", help=text)
+    add("--json", type=Path, metavar="FILE", help="write all results")
+    add("--csv", type=Path, metavar="FILE", help="write the section's points")
+    add("--x3p", type=Path, metavar="FILE", help="write the height map as X3P")
 
 
 def run(args: argparse.Namespace) -> int:

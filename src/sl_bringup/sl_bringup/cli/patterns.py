@@ -91,26 +91,18 @@ def add_parser(subparsers: Any) -> None:
     """Register ``slrig patterns``."""
     parser = subparsers.add_parser(
         "patterns",
-        help="write a sequence's file and its frames as PNG",
         description="Write a sequence's file (sequence.yaml) and its frames as PNG, numbered in "
         "order of projection, for use with any projector.",
         epilog="examples:\n"
         "  slrig patterns precise --output frames\n"
         "  slrig patterns paper-rows --output frames --dmd-size 1920x1080\n"
         "  slrig patterns examples/procam_board.yaml --output frames",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "sequence", metavar="NAME|FILE", help=f"{', '.join(sorted(NAMED))}, or a sequence file"
-    )
-    parser.add_argument("--output", required=True, type=Path, metavar="DIR", help="folder for them")
-    parser.add_argument(
-        "--dmd-size",
-        type=dmd_size,
-        metavar="WxH",
-        help="DMD columns x rows of a built-in sequence (default 1024x768)",
-    )
-    parser.set_defaults(run=run)
+    add = parser.add_argument
+    add("sequence", metavar="NAME|FILE", help=f"{', '.join(sorted(NAMED))}, or a sequence file")
+    add("--output", required=True, type=Path, metavar="DIR", help="folder for them")
+    text = "DMD columns x rows of a built-in sequence (default 1024x768)"
+    add("--dmd-size", type=dmd_size, metavar="WxH", help=text)
 
 
 def run(args: argparse.Namespace) -> int:

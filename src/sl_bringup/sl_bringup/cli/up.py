@@ -10,9 +10,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sl_bringup.graph.client_process import add_domain_arguments
+from sl_bringup.graph.client_process import add_domain_arguments, become_client
 from sl_bringup.graph.console import INTERRUPTED, complain, say
-from sl_bringup.graph.graph import Graph, GraphOptions
+from sl_bringup.graph.graph import Graph, GraphOptions, client_command, is_running
 from sl_bringup.graph.graph_config import Changes
 from sl_common.errors import ConfigError
 
@@ -32,6 +32,25 @@ def add_graph_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...", help=text
     )
+
+
+def add_client_options(parser: argparse.ArgumentParser, timeout_s: float) -> None:
+    """Arguments of a command that asks the graph for something, and may start one for it.
+
+    Parameters
+    ----------
+    parser : ArgumentParser
+        Of the command.
+    timeout_s : float
+        How long the command takes at most by default, seconds.
+    """
+    add = parser.add_argument
+    text = f"longest time for the work itself (default: {timeout_s:g})"
+    add("--timeout", type=float, default=timeout_s, metavar="S", help=text)
+    add("--up", action="store_true", help="start a graph for this where none is running")
+    text = "with --up: for the graph to get ready, compiling apart (default: 240)"
+    add("--ready-timeout", type=float, default=240.0, metavar="S", help=text)
+    add("--verbose", action="store_true", help="with --up: show the graph's log")
 
 
 def graph_options(args: argparse.Namespace) -> GraphOptions:
@@ -68,30 +87,62 @@ async def until_signal(work: Awaitable[_ResultT]) -> _ResultT | None:
             loop.add_signal_handler(number, lambda: None)
 
 
-async def run_once(
+def run_client(
+    client: str,
+    args: argparse.Namespace,
+    options: GraphOptions,
+    log: Path,
+    before: Callable[[Graph], Awaitable[int]] | None = None,
+) -> int:
+    """Run a client of the graph: of the running one, or with ``--up`` of one started for it.
+
+    Parameters
+    ----------
+    client : str
+        Module of the client, which parses the user's words again.
+    args : Namespace
+        Of a parser with `add_client_options`.
+    options : GraphOptions
+        Which graph is meant, and how it is started.
+    log : Path
+        For every line of a graph that is started.
+    before : callable, optional
+        Work that comes before the client when the graph is ready; a status other than 0 ends all.
+
+    Returns
+    -------
+    int
+        Exit status: 0 when the work went well and the graph ended cleanly, 130 after a signal.
+    """
+    if not args.up or is_running(options.directory):
+        return become_client(client, args.words, options.transport)
+
+    async def work(graph: Graph) -> int:
+        if not await graph.ready(args.ready_timeout):
+            return 1
+        if before is not None and (status := await before(graph)):
+            return status
+        return await graph.run_client(client_command(client, *args.words))
+
+    log.parent.mkdir(parents=True, exist_ok=True)
+    say(f"starting the graph{' on the bench' if options.bench else ''} (log: {log})")
+    with log.open("w") as file:
+
+        def tell(line: str) -> None:
+            file.write(line + "\n")
+            if args.verbose:
+                say(line)
+
+        return asyncio.run(_with_graph(options, tell, work, args.command))
+
+
+async def _with_graph(
     options: GraphOptions,
     tell: Callable[[str], object],
     work: Callable[[Graph], Awaitable[int]],
     command: str,
 ) -> int:
-    """Start a graph, do something with it, stop it.
-
-    Parameters
-    ----------
-    options : GraphOptions
-        What it is started with.
-    tell : callable
-        Gets every line of its processes.
-    work : callable
-        Returns an exit status.
-    command : str
-        For which the user started it, for complaints.
-
-    Returns
-    -------
-    int
-        Exit status: 0 when the work went well and everything ended cleanly, 130 after a signal.
-    """
+    """Start a graph, do something with it, stop it."""
     async with Graph(options, tell) as graph:
         status = await until_signal(work(graph))
     if status is None:
