@@ -76,10 +76,8 @@ def run(args: argparse.Namespace) -> int:
     made_from = {"bag": args.bag.name, "corners": list(args.corners), "square_m": board.square_m}
     save_calibration(args.output, Calibration(pair.rig, None, residuals, made_from))
     for scan, used in zip(names, solution.used, strict=True):
-        if not used.all():
-            off = ", ".join(
-                f"({k % args.corners[0]}, {k // args.corners[0]})" for k in (~used).nonzero()[0]
-            )
+        rows, columns = divmod((~used).nonzero()[0], args.corners[0])
+        if off := ", ".join(f"({c}, {r})" for c, r in zip(columns, rows, strict=True)):
             say(f"scan {scan}: left out, off the model: corners (column, row) {off}")
     say(
         f"stereo rms {pair.rms_px:.3f} px ({solution.all_rms_px:.3f} with every corner), camera "

@@ -160,7 +160,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _scans_in(path: Path, namespace: str | None) -> int:
-    """Scans of a bag, for the progress; a bag that cannot be read is told later."""
+    """Scans of a bag, for the progress; a bag that cannot be read is reported later."""
     try:
         with open_bag(path, namespace) as bag:
             return count_scans(bag)

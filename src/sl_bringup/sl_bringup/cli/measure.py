@@ -9,8 +9,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sl_bringup.graph.console import say
 from sl_common.documents import written_atomically
 from sl_common.errors import ConfigError, StackError
@@ -27,7 +25,7 @@ from sl_reconstruct.measure.result import Measurement, Tolerance, rounded
 from sl_reconstruct.measure.roughness import RoughnessMeasurement
 
 MILLIMETRE_M, MICROMETRE_M = 1e-3, 1e-6
-#: Measurements told in millimetres; other lengths are told in micrometres.
+#: Measurements shown in millimetres; other lengths are shown in micrometres.
 IN_MILLIMETRES = ("sphere", "cylinder", "hole")
 
 
@@ -176,8 +174,8 @@ def _draw(path: Path, points: Points, found: Measurement, title: str) -> None:
         partial.write_bytes(png)
 
 
-def told(found: Measurement) -> tuple[float, str]:
-    """Units that a value is told in per its own, and their name."""
+def _shown_in(found: Measurement) -> tuple[float, str]:
+    """Unit that a value is shown in: how many make one of its own, and its name."""
     if found.unit != "m":
         return 1.0, {"deg": "degrees"}.get(found.unit, "")
     if found.kind in IN_MILLIMETRES:
@@ -190,24 +188,16 @@ def _verdict(found: Measurement, tolerance: Tolerance | None, name: str | None) 
     if tolerance is None:
         return ""
     judged = found.quantity(name)
-    factor = told(found)[0] if judged.unit == "m" else 1.0
+    factor = _shown_in(found)[0] if judged.unit == "m" else 1.0
     return tolerance.verdict(factor * judged.value, factor * judged.uncertainty)
 
 
 def lines(found: Measurement) -> Iterator[str]:
     """Lines that tell a person what was measured."""
-    factor, unit = told(found)
-    names = {
-        "plane": "flatness",
-        "deviation": "mean deviation",
-        "roughness": "Sq",
-        "angle": "included angle",
-        "hole": "diameter",
-        "profile": "height of section",
-        "sphere": "radius",
-        "cylinder": "radius",
-        "step": "step height",
-    }
+    factor, unit = _shown_in(found)
+    names = {"plane": "flatness", "deviation": "mean deviation", "roughness": "Sq",
+             "angle": "included angle", "hole": "diameter", "profile": "height of section",
+             "sphere": "radius", "cylinder": "radius", "step": "step height"}  # fmt: skip
     yield (
         f"{names[found.kind]:<18}{rounded(factor * found.value, factor * found.uncertainty)} "
         f"{unit} (standard uncertainty)"
@@ -252,9 +242,5 @@ def _details(found: Measurement) -> Iterator[str]:
 
 
 def _plain(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave maps of whole clouds out of what goes to JSON."""
-    return {
-        key: value
-        for key, value in content.items()
-        if not (isinstance(value, np.ndarray) and value.ndim > 1)
-    }
+    """Content without arrays of a cloud's size, for JSON."""
+    return {key: value for key, value in content.items() if getattr(value, "ndim", 0) < 2}

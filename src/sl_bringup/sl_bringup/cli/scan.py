@@ -32,7 +32,7 @@ def add_parser(subparsers: Any) -> None:
     add("--output", required=True, type=Path, metavar="DIR", help="for the results")
     add("--sequence", default="", help="pattern sequence (default: the projector's)")
     add("--exposure", type=float, default=0.0, metavar="S", help="of each pattern, seconds")
-    add("--repeats", type=int, metavar="N", help="repeat a spoilt scan so often")
+    add("--repeats", type=int, metavar="N", help="repeat a spoilt scan up to N times")
     add("--measure", choices=["groove"], default="", help="measure a feature of the cloud")
     add("--no-pictures", action="store_true", help="neither pictures nor page")
     text = "with --up --bench: begin with an unknown rig and calibrate it on the hole plate"

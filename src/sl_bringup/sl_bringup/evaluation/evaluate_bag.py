@@ -24,11 +24,10 @@ from sl_bringup.evaluation.settings_overrides import parse_choices
 from sl_bringup.graph.version import software_version
 from sl_bringup.results.evaluation_folder import clear_results, write_summary
 from sl_bringup.results.scan_files import write_scan
-from sl_bringup.results.scan_page import write_page
+from sl_bringup.results.scan_page import write_report
 from sl_camera.sync.match_events import FrameDecision, Status
 from sl_camera.sync.matching import StackMatcher
 from sl_common.errors import BagError, CalibrationError, SlError
-from sl_common.json_file import write_json
 from sl_common.topics import TRIGGER
 from sl_projector.sequence.stack import Stack
 from sl_reconstruct.cloud.cloud import Cloud
@@ -130,7 +129,7 @@ def evaluate_bag(path: Path, output: Path, choices: Choices, crew: Crew) -> Resu
     BagError
         When the recording cannot be read or holds no scan.
     CalibrationError
-        When no usable calibration is at hand.
+        When there is no usable calibration.
     """
     with open_bag(path, choices.namespace) as bag:
         clear_results(output)
@@ -173,7 +172,7 @@ class _BagRun:
         self._names: list[int] = []
 
     def run(self) -> list[Report]:
-        """Read, and keep so many scans under way as there are threads, and one more."""
+        """Read; at most one scan more than there are threads is under way."""
         reports: list[Report] = []
         waiting: deque[tuple[FrameDecision, Future[Report]]] = deque()
         for decision in self._verdicts():
@@ -236,7 +235,11 @@ class _BagRun:
             raise
         except SlError as exc:
             report["reasons"].append(str(exc))
-        self._write(folder, report, cloud, decision.stack, first)
+        pictures = self._choices.pictures
+        wanted = pictures == "all" or (pictures == "first" and first)
+        images = decision.stack.images if decision.stack else None
+        drawn = write_scan(folder, report, cloud, wanted, images)
+        write_report(folder, report, drawn if pictures != "none" else None)
         return report
 
     def _settings_of(self, scan_id: int) -> Settings:
@@ -257,16 +260,6 @@ class _BagRun:
         report.update(ScanSummary.of(product, stack).to_dict(), good=good, reasons=reasons)
         report["live"] = self._live.compare(report)
         return product.cloud
-
-    def _write(
-        self, folder: Path, report: Report, cloud: Cloud | None, stack: Stack | None, first: bool
-    ) -> None:
-        pictures = self._choices.pictures
-        wanted = pictures == "all" or (pictures == "first" and first)
-        drawn = write_scan(folder, report, cloud, wanted, stack.images if stack else None)
-        write_json(folder / "report.json", report)
-        if pictures != "none":
-            write_page(folder / "report.html", report, drawn)
 
 
 class Workshops:

@@ -18,18 +18,12 @@ from sl_reconstruct.cloud.cloud_reader import read_cloud
 
 #: Standard deviation over the median of absolute values, of a normal distribution.
 MAD = 1.4826
-#: More would be a mistake: each is a whole evaluation.
+#: More would be a mistake: each takes as long as an evaluation.
 MAX_VARIANTS = 64
 PICTURES = ("picture_residual.png", "picture_refusals.png")
 COLUMNS = (
-    "scans",
-    "good",
-    "points",
-    "of the lit",
-    "sigma of z",
-    "noise / bound",
-    "plane rms",
-    "z off first",
+    *("scans", "good", "points", "of the lit"),
+    *("sigma of z", "noise / bound", "plane rms", "z off first"),
 )
 _TEMPLATE = Path(__file__).parent / "templates" / "sweep.html"
 

@@ -23,12 +23,12 @@ SUMMARY_KEYS = (
 
 
 def clear_results(output: Path) -> None:
-    """Take away what an earlier evaluation wrote here, so that no old scan passes for a new one.
+    """Delete what an earlier evaluation wrote here, so that no old scan passes for a new one.
 
     Raises
     ------
     ConfigError
-        When the folder's ``summary.json`` is somebody else's.
+        When the folder's ``summary.json`` was not written by an evaluation.
     """
     summary = output / "summary.json"
     if not summary.is_file():

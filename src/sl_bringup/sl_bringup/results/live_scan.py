@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from sl_bringup.graph.version import software_version
 from sl_bringup.results.paper_tables import table_2_lines
 from sl_bringup.results.scan_files import write_scan
-from sl_bringup.results.scan_page import included_angle, write_page
-from sl_common.json_file import write_json
+from sl_bringup.results.scan_page import included_angle, write_report
 from sl_common.pages.page import length
 from sl_reconstruct.cloud.cloud import CLOUD_DTYPE, Cloud
 from sl_reconstruct.cloud.cloud_writer import cloud_hash
@@ -79,9 +78,7 @@ def write_result(
         found = beside.submit(_measured, points, measure)
         drawn = write_scan(folder, report, cloud, pictures)
     report.update(found.result())
-    write_json(folder / "report.json", report)
-    if pictures:
-        write_page(folder / "report.html", report, drawn)
+    write_report(folder, report, drawn if pictures else None)
 
 
 def _measured(points: NDArray[Any] | None, measure: str) -> dict[str, Any]:
@@ -112,15 +109,13 @@ def check_cloud(points: NDArray[Any], report: Mapping[str, Any]) -> str:
 def _cloud(
     points: NDArray[Any], report: Mapping[str, Any], reason: NDArray[np.uint8] | None
 ) -> Cloud:
-    """Cloud as far as messages tell it."""
+    """Cloud with what the messages carry; the columns of the edges are not in them."""
     if reason is None or reason.shape != points.shape:
         there = np.isfinite(points["z"])
         reason = np.where(there, Reason.PRESENT, Reason.UNLIT).astype(np.uint8)
     nothing = np.full(points.shape, np.nan, np.float32)
-    refused = dict(report["refused"])
-    return Cloud(
-        points.astype(CLOUD_DTYPE, copy=False), nothing, reason, refused, report["lit_positions"]
-    )
+    points = points.astype(CLOUD_DTYPE, copy=False)
+    return Cloud(points, nothing, reason, dict(report["refused"]), report["lit_positions"])
 
 
 def _groove(found: AngleMeasurement | None) -> dict[str, Any]:

@@ -35,9 +35,8 @@ def table_2_lines(report: Mapping[str, Any]) -> Iterator[str]:
     """Lines of Table 2 from a scan's report with a groove found in it."""
     groove = report["groove"]
     sides = [groove["left"], groove["right"]]
-    rms = math.sqrt(
-        sum(s["rms_m"] ** 2 * s["points"] for s in sides) / max(1, sum(s["points"] for s in sides))
-    )
+    points = max(1, sum(side["points"] for side in sides))
+    rms = math.sqrt(sum(side["rms_m"] ** 2 * side["points"] for side in sides) / points)
     width_m, height_m = report.get("area_m", (math.nan, math.nan))
     seconds = report["acquisition_s"] + report["processing_s"]
     ours = [

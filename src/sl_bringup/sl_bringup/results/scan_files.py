@@ -21,13 +21,9 @@ Drawn = dict[str, tuple[str, bytes]]
 #: Points that a plane is fitted to, about; more change nothing.
 PLANE_POINTS = 100_000
 FILES = ("cloud.ply", "cloud.pcd", "height.tiff", "height.png", "report.json", "report.html")
-PICTURES = (
-    "picture_height",
-    "picture_relief",
-    "picture_residual",
-    "picture_profile",
-    "picture_refusals",
-    "picture_contrast",
+PICTURES = tuple(
+    f"picture_{name}"
+    for name in ("height", "relief", "residual", "profile", "refusals", "contrast")
 )
 
 

@@ -7,35 +7,35 @@ from pathlib import Path
 from typing import Any
 
 from sl_common.documents import write_text
+from sl_common.json_file import write_json
 from sl_common.pages.page import render_page
 from sl_reconstruct.measure.result import rounded
 
 _TEMPLATE = Path(__file__).parent / "templates" / "scan.html"
 
 
-def write_page(path: Path, report: Mapping[str, Any], pictures: Mapping[str, bytes]) -> None:
-    """Write the page of one scan, its pictures inside it.
+def write_report(
+    folder: Path, report: Mapping[str, Any], pictures: Mapping[str, bytes] | None
+) -> None:
+    """Write ``report.json`` and the page ``report.html`` of one scan.
 
     Parameters
     ----------
-    path : Path
-        The page.
+    folder : Path
+        The scan's.
     report : mapping
         The scan's report.
-    pictures : mapping
-        PNG by caption.
+    pictures : mapping, optional
+        PNG by caption, for the page; without them there is no page.
     """
+    write_json(folder / "report.json", report)
+    if pictures is None:
+        return
     live = report["bag"] == "live"
     title = f"Scan {report['scan_id']}" + (", live" if live else f" of {report['bag']}")
-    page = render_page(
-        _TEMPLATE,
-        title=title,
-        report=report,
-        banner=banner(report),
-        pictures=pictures,
-        angle=included_angle(report),
-    )
-    write_text(path, page)
+    found = {"banner": banner(report), "angle": included_angle(report)}
+    page = render_page(_TEMPLATE, title=title, report=report, pictures=pictures, **found)
+    write_text(folder / "report.html", page)
 
 
 def banner(report: Mapping[str, Any]) -> tuple[bool, str]:

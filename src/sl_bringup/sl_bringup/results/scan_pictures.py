@@ -19,12 +19,12 @@ from sl_reconstruct.measure.profile import ProfileMeasurement
 
 #: Heights outside this part of all heights do not stretch the colours.
 COLOUR_PERCENTILES = (0.5, 99.5)
-#: A range of heights below this is told in micrometres, above in millimetres.
+#: Heights that span less than this are shown in micrometres, others in millimetres.
 MICROMETRES_BELOW_M = 5e-3
 MISSING_COLOUR = "#d9d9d9"
 #: The same in a picture that is itself grey.
 ABSENT_COLOUR = "#f6d9c4"
-#: Above so many rows a single pixel of a picture is lost, and shown enlarged.
+#: With more rows than this a single pixel would not be seen in a picture: it is enlarged.
 ENLARGE_ABOVE_ROWS = 400
 #: Where more than this part is refused, enlarged ones would hide the points between them.
 ENLARGE_BELOW = 0.03
@@ -42,6 +42,9 @@ REASON_COLOURS = (
 )
 PRESENT_COLOUR = "#CFE8CF"
 SATURATED_COLOUR = "#FF0000"
+#: Of a section, and of the band of its uncertainty.
+LINE_STYLE: dict[str, Any] = {"color": "#0072B2", "linewidth": 0.8}
+BAND_STYLE: dict[str, Any] = {"color": "#56B4E9", "alpha": 0.6, "linewidth": 0}
 
 
 def height_picture(height: HeightMap, title: str) -> bytes:
@@ -123,16 +126,9 @@ def profile_picture(points: NDArray[Any], title: str) -> bytes:
     x_mm, z_m, sigma_m = broken_at_gaps(x_mm, z_m, sigma_m)
     figure = Figure(figsize=(9, 6), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    above.fill_between(
-        x_mm,
-        (z_m - 2 * sigma_m) * factor,
-        (z_m + 2 * sigma_m) * factor,
-        color="#56B4E9",
-        alpha=0.6,
-        linewidth=0,
-        label="± 2 sigma (stated)",
-    )
-    above.plot(x_mm, z_m * factor, color="#0072B2", linewidth=0.8, label="measured")
+    bounds = ((z_m - 2 * sigma_m) * factor, (z_m + 2 * sigma_m) * factor)
+    above.fill_between(x_mm, *bounds, **BAND_STYLE, label="± 2 sigma (stated)")
+    above.plot(x_mm, z_m * factor, **LINE_STYLE, label="measured")
     above.set(ylabel=f"height z / {unit}", title=f"{title}\nsection along camera row {row}")
     # Outside: "best" knows nothing of lines with gaps, and lay over one.
     figure.legend(loc="outside lower center", ncols=2, frameon=False)
@@ -158,16 +154,9 @@ def section_picture(sections: Sequence[tuple[str, ProfileMeasurement]], title: s
     figure.suptitle(title)
     for (name, s), part in zip(sections, axes, strict=True):
         x_mm, z_um, u_um = broken_at_gaps(1e3 * s.along_m, 1e6 * s.z_m, 1e6 * s.u_z_m)
-        part.fill_between(
-            x_mm,
-            z_um - 2 * u_um,
-            z_um + 2 * u_um,
-            color="#56B4E9",
-            alpha=0.6,
-            linewidth=0,
-            label="± 2 standard uncertainties",
-        )
-        part.plot(x_mm, z_um, color="#0072B2", linewidth=0.8, label=name)
+        bounds = (z_um - 2 * u_um, z_um + 2 * u_um)
+        part.fill_between(x_mm, *bounds, **BAND_STYLE, label="± 2 standard uncertainties")
+        part.plot(x_mm, z_um, **LINE_STYLE, label=name)
         part.set_ylabel("z / µm")
         part.grid(True, alpha=0.3)
         part.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
@@ -195,14 +184,8 @@ def refusal_picture(
     colours = ListedColormap([PRESENT_COLOUR, MISSING_COLOUR, *palette])
     figure = Figure(figsize=(9, 6), layout="constrained")
     axes = figure.subplots()
-    axes.imshow(
-        _enlarged(reasons),
-        cmap=colours,
-        vmin=-0.5,
-        vmax=len(palette) + 1.5,
-        aspect="auto",
-        interpolation="nearest",
-    )
+    scale: dict[str, Any] = {"cmap": colours, "vmin": -0.5, "vmax": len(palette) + 1.5}
+    axes.imshow(_enlarged(reasons), **scale, aspect="auto", interpolation="nearest")
     axes.set(xlabel="DMD column boundary", ylabel="camera row", title=title)
     entries = [
         ("points", PRESENT_COLOUR),
@@ -233,9 +216,9 @@ def contrast_picture(images: NDArray[Any], saturation_dn: int, title: str) -> by
     colours = colormaps["viridis"].with_extremes(bad=SATURATED_COLOUR)
     figure = Figure(figsize=(9, 1.2 + 7.2 * full.shape[0] / full.shape[1]), layout="constrained")
     axes = figure.subplots()
-    told = f"brightest less darkest image (red: saturated, {100 * full.mean():.2g} %)"
+    caption = f"brightest less darkest image (red: saturated, {100 * full.mean():.2g} %)"
     image = axes.imshow(np.where(full, np.nan, contrast), cmap=colours, vmin=0.0, vmax=100.0)
-    axes.set(xlabel="camera column / px", ylabel="camera row / px", title=f"{title}\n{told}")
+    axes.set(xlabel="camera column / px", ylabel="camera row / px", title=f"{title}\n{caption}")
     figure.colorbar(image, ax=axes, shrink=0.9, label="contrast / % of full scale")
     return png(figure)
 
@@ -273,13 +256,8 @@ def _map(
     missing = "" if np.isfinite(values_m).all() else " (grey: not measured)"
     figure, axes = _map_axes(height, title + missing)
     axes.set_facecolor(MISSING_COLOUR)
-    image = axes.imshow(
-        values_m * factor,
-        cmap=colours,
-        vmin=low * factor,
-        vmax=high * factor,
-        extent=_extent_mm(height),
-    )
+    scale: dict[str, Any] = {"cmap": colours, "vmin": low * factor, "vmax": high * factor}
+    image = axes.imshow(values_m * factor, extent=_extent_mm(height), **scale)
     bar = figure.colorbar(image, ax=axes, extend="both", shrink=0.9)
     bar.set_label(f"{label} / {unit}")
     return png(figure)
@@ -303,7 +281,7 @@ def _extent_mm(height: HeightMap) -> tuple[float, float, float, float]:
 
 
 def _unit(values_m: NDArray[Any]) -> tuple[str, float]:
-    """Unit in which a range of lengths is told, and units per metre."""
+    """Unit that suits a range of lengths, and units per metre."""
     spread = float(np.ptp(values_m)) if values_m.size else 0.0
     return ("µm", 1e6) if spread < MICROMETRES_BELOW_M else ("mm", 1e3)
 

@@ -88,11 +88,9 @@ def _residuals_by_height(solved: JudgedSolution) -> Figure:
         axes.plot(heights * _MM, np.array(rms) * _UM, "o-", color="C3", label="rms of the height")
         floor = np.sqrt(2) * group.sigma_px * group.metres * _UM
         axes.axhline(floor, color="C0", ls="--", lw=1, label="stated noise")
-        axes.set(
-            title=f"{group.name}: {len(group.height_m):,} residuals",
-            xlabel="stage height, mm", ylabel="residual on the part, µm",
-            ylim=(0, 1.15 * float(np.quantile(group.lengths_m, 0.999)) * _UM),
-        )  # fmt: skip
+        axes.set_title(f"{group.name}: {len(group.height_m):,} residuals")
+        highest = 1.15 * float(np.quantile(group.lengths_m, 0.999)) * _UM
+        axes.set(xlabel="stage height, mm", ylabel="residual on the part, µm", ylim=(0, highest))
         axes.legend(loc="upper right", fontsize=8)
     return figure
 
@@ -106,10 +104,9 @@ def _residual_vectors(solved: JudgedSolution) -> Figure:
         (u, v), (du, dv) = group.pixels[few].T, group.residuals_px[few].T
         rms = float(np.sqrt(np.mean(np.hypot(du, dv) ** 2)))
         arrow = 0.04 * group.size[0] / max(rms, 1e-12)
-        arrows = axes.quiver(
-            u, v, du * arrow, dv * arrow, group.height_m[few] * _MM, angles="xy",
-            scale_units="xy", scale=1, width=0.0018, cmap="viridis",
-        )  # fmt: skip
+        style = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.0018}
+        heights_mm = group.height_m[few] * _MM
+        arrows = axes.quiver(u, v, du * arrow, dv * arrow, heights_mm, cmap="viridis", **style)
         _image_axes(axes, group.size)
         axes.set(
             title=f"{group.name}: rms {rms:.4f} {group.unit}",
@@ -183,10 +180,9 @@ def off_planes(layers: Sequence[tuple[float, Array, Array]]) -> Figure:
     most = float(np.quantile(np.abs(np.concatenate([off for _, _, off in layers])), 0.99)) * _UM
     panels = figure.subplots(1, len(layers), squeeze=False)[0]
     for axes, (height_m, points_m, off_m) in zip(panels, layers, strict=True):
-        dots = axes.scatter(
-            points_m[:, 0] * _MM, points_m[:, 1] * _MM, c=off_m * _UM, s=10, cmap="RdBu",
-            vmin=-most, vmax=most,
-        )  # fmt: skip
+        x_mm, y_mm = points_m[:, :2].T * _MM
+        scale = {"cmap": "RdBu", "vmin": -most, "vmax": most}
+        dots = axes.scatter(x_mm, y_mm, c=off_m * _UM, s=10, **scale)
         title = f"off the best plane, stage at {height_m * _MM:.3f} mm"
         axes.set(xlabel="x, mm", ylabel="y, mm", aspect="equal", title=title)
         axes.title.set_fontsize(9)
