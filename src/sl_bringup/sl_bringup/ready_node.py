@@ -120,22 +120,22 @@ def wait(node: ReadyNode, timeout_s: float, for_compiler: bool = False) -> bool:
     bool
         Whether everything is there.
     """
-    executor = SingleThreadedExecutor(context=node.context)
-    executor.add_node(node)
     blocked_s = time.monotonic()
     next_s = blocked_s + PATIENCE_S
-    while missing := node.missing():
-        executor.spin_once(timeout_sec=0.1)
-        now_s = time.monotonic()
-        if for_compiler and all(fault.compiling for fault in missing):
-            blocked_s = now_s
-        words = "; ".join(fault.text for fault in missing)
-        if timeout_s and now_s - blocked_s > timeout_s:
-            complain(f"graph not ready: {words}")
-            return False
-        if now_s > next_s:
-            next_s = now_s + REPEAT_S
-            say(f"waiting: {words}")
+    with SingleThreadedExecutor(context=node.context) as executor:
+        executor.add_node(node)
+        while missing := node.missing():
+            executor.spin_once(timeout_sec=0.1)
+            now_s = time.monotonic()
+            if for_compiler and all(fault.compiling for fault in missing):
+                blocked_s = now_s
+            words = "; ".join(fault.text for fault in missing)
+            if timeout_s and now_s - blocked_s > timeout_s:
+                complain(f"graph not ready: {words}")
+                return False
+            if now_s > next_s:
+                next_s = now_s + REPEAT_S
+                say(f"waiting: {words}")
     return True
 
 
