@@ -1,8 +1,8 @@
 """The folder of calibrations: one folder per run, and which of them is in force.
 
-A run that was rejected is kept beside the others, for who wants to know why; only an accepted
-one is ever named by the pointer file ``current``. The file ``camera`` names the run of a camera
-that was calibrated alone, until a rig is put in force.
+A rejected run stays beside the others, as evidence; the pointer file ``current`` names accepted
+runs only. The file ``camera`` names the run of a camera that was calibrated alone, until a rig is
+put in force.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ class Store:
         CalibrationError
             When it is no run of this folder with a calibration.
         """
-        write_text(self.directory / _POINTER, self._checked(run.name).parent.name + "\n")
+        self._checked(run.name, CALIBRATION)
+        write_text(self.directory / _POINTER, run.name + "\n")
         (self.directory / _CAMERA_POINTER).unlink(missing_ok=True)
 
     def put_camera(self, run: Path) -> None:
@@ -76,10 +77,7 @@ class Store:
 
     def camera(self) -> Path | None:
         """Return the file of the camera that waits for its projector; errors as `current`."""
-        pointer = self.directory / _CAMERA_POINTER
-        if not pointer.exists():
-            return None
-        return self._checked(read_text(pointer, CalibrationError).strip(), CAMERA)
+        return self._named_by(_CAMERA_POINTER, CAMERA)
 
     def current(self) -> Path | None:
         """Return the calibration file in force, None when there never was one.
@@ -89,17 +87,21 @@ class Store:
         CalibrationError
             When the pointer names a run that is not here.
         """
-        pointer = self.directory / _POINTER
-        if not pointer.exists():
-            return None
-        return self._checked(read_text(pointer, CalibrationError).strip())
+        return self._named_by(_POINTER, CALIBRATION)
 
     def in_force_since_ns(self) -> int:
         """When the pointer was last changed; 0 when there is none."""
         pointer = self.directory / _POINTER
         return pointer.stat().st_mtime_ns if pointer.exists() else 0
 
-    def _checked(self, name: str, kind: str = CALIBRATION) -> Path:
+    def _named_by(self, pointer: str, kind: str) -> Path | None:
+        """Calibration of the run that a pointer names; None without a pointer."""
+        file = self.directory / pointer
+        if not file.exists():
+            return None
+        return self._checked(read_text(file, CalibrationError).strip(), kind)
+
+    def _checked(self, name: str, kind: str) -> Path:
         """Calibration of a run; a name never leads out of the directory."""
         file = self.directory / name / kind
         if not name or Path(name).name != name or name in (".", "..") or not file.is_file():
