@@ -104,7 +104,7 @@ def imports(file: Path) -> Iterator[tuple[str, int]]:
         if isinstance(node, ast.Import):
             yield from ((alias.name, node.lineno) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{label(file)}:{node.lineno} imports relatively"
+            assert node.level == 0, f"{file}:{node.lineno} imports relatively"
             yield from ((f"{node.module}.{alias.name}", node.lineno) for alias in node.names)
 
 
@@ -157,6 +157,8 @@ def test_test_files_are_short_and_their_folders_hold_few() -> None:
     # Modules of tests are no packages, so their names must differ.
     names = [f.name for f in files if f.name.startswith("test_")]
     assert len(names) == len(set(names))
+    shared = [f for f in files for name, _ in imports(f) if name.startswith("test_")]
+    assert not shared, "what tests share belongs to tests/support"
 
 
 def module(file: Path) -> str:

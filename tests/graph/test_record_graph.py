@@ -15,10 +15,10 @@ from rosbags.highlevel import AnyReader
 from support.patience import wait
 from support.ros_graph import graph as ros_graph
 from support.ros_graph import require_ros
+from support.slrig_command import READY_PATIENCE_S, Command
 
 require_ros()
 
-from test_slrig_graph import READY_PATIENCE_S, Command  # noqa: E402
 
 from sl_bringup.bag.bags import open_bag  # noqa: E402
 from sl_bringup.cli.main import main  # noqa: E402

@@ -1,6 +1,7 @@
 """Recordings of two small scans, and damage done to them at random.
 
-As a script it does more of what the test does: ``python tests/bag_damage.py 200`` (seeds 0 to 199).
+As a script it does more of what the test does: ``python -m support.bag_damage 200`` in ``tests``
+(seeds 0 to 199).
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from test_evaluate_many import START_NS, write_scans
 
 from sl_bringup.bag.bag_recorder import BagRecorder
 from sl_bringup.bag.bag_writer import new_bag, topic_qos
@@ -25,6 +25,7 @@ from sl_common.topics import CALIBRATION, EVALUATED_TOPICS
 from sl_reconstruct.cloud.cloud_reader import read_cloud
 from sl_reconstruct.model.calibration_file import Calibration
 from support.scenes.rigs import tiny_rig
+from support.scenes.tiny_bags import START_NS, write_scans
 from support.scenes.tiny_scans import HEIGHT_M, SLOPE, render, tiny_sequence
 
 #: Kinds of bags; only the recorder's own have checksums.

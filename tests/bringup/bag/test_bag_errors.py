@@ -21,14 +21,6 @@ from sl_common.topics import IMAGE, POSE, TRIGGER
 from support.scenes.made_bags import COUNT, START_NS, count_images, fill, frames
 
 
-def test_broken_metadata_costs_nothing_but_is_told(bag_path: Path) -> None:
-    text = (bag_path / "metadata.yaml").read_text()
-    (bag_path / "metadata.yaml").write_text(text[: len(text) // 2])
-    images, lost, _ = count_images(bag_path)
-    assert images == COUNT
-    assert lost
-
-
 def one_message_per_chunk(path: Path) -> list[int]:
     """A bag whose images lie in chunks of their own; the byte at which each chunk ends."""
     store = typestore()

@@ -27,6 +27,18 @@ ROSBAG2 = DATA / "rosbag2"
 needs_rosbag2 = pytest.mark.skipif(not ROSBAG2.is_dir(), reason=f"no data in {ROSBAG2}")
 
 
+@pytest.fixture(params=["mcap", "sqlite3"])
+def storage(request: pytest.FixtureRequest) -> Storage:
+    return request.param
+
+
+@pytest.fixture
+def bag_path(tmp_path: Path, storage: Storage) -> Path:
+    with new_bag(tmp_path / "a", storage) as bag:
+        fill(bag, frames())
+    return tmp_path / "a"
+
+
 def test_what_is_written_is_read(bag_path: Path) -> None:
     images = frames()
     with open_bag(bag_path) as bag:
@@ -147,6 +159,14 @@ def test_bag_without_metadata_is_read_whole(bag_path: Path) -> None:
 def test_bare_file_is_read_whole(bag_path: Path) -> None:
     file = next(p for p in bag_path.iterdir() if p.suffix in (".mcap", ".db3"))
     assert count_images(file) == (COUNT, [], [])
+
+
+def test_broken_metadata_costs_nothing_but_is_told(bag_path: Path) -> None:
+    text = (bag_path / "metadata.yaml").read_text()
+    (bag_path / "metadata.yaml").write_text(text[: len(text) // 2])
+    images, lost, _ = count_images(bag_path)
+    assert images == COUNT
+    assert lost
 
 
 def test_two_rigs_need_a_name(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_evaluate_many import START_NS, evaluate, live_report, summary, write_scans
 
 from sl_bringup.bag.bag_writer import BagWriter, new_bag
 from sl_bringup.bag.bags import make_message
@@ -19,6 +18,7 @@ from sl_reconstruct.decode import stack_statistics
 from sl_reconstruct.decode.settings import Settings
 from sl_reconstruct.model.calibration_file import Calibration
 from support.scenes.rigs import tiny_rig
+from support.scenes.tiny_bags import START_NS, evaluate, live_report, summary, write_scans
 from support.scenes.tiny_scans import render, tiny_sequence
 
 

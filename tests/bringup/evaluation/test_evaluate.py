@@ -18,18 +18,16 @@ from sl_bringup.cli.main import main
 from sl_bringup.evaluation.settings_overrides import parse_choices
 from sl_common.errors import ConfigError
 from sl_projector.sequence.pattern_sequence import PatternSequence
-from sl_reconstruct.model.calibration_file import Calibration, rig_hash, save_calibration
+from sl_reconstruct.model.calibration_file import rig_hash, save_calibration
 from sl_reconstruct.model.rig import Rig
 from support.paths import DATA, EXAMPLES
 from support.scenes.rigs import DMD_SIZE, tiny_rig
+from support.scenes.tiny_bags import START_NS, record
 from support.scenes.tiny_scans import HEIGHT_M, SLOPE, render, tiny_sequence, write_images
 
 BOARD = DATA / "procam_board"
 EXAMPLE = EXAMPLES / "procam_board.yaml"
 needs_board = pytest.mark.skipif(not BOARD.is_dir(), reason=f"no data in {BOARD}")
-
-START_NS = 1_700_000_000_000_000_000
-FRAME_NS = 20_000_000
 
 
 @pytest.fixture(scope="module")
@@ -46,32 +44,6 @@ def frames(sequence: PatternSequence) -> np.ndarray:
 def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("cal") / "cal.yaml"
     save_calibration(path, tiny_rig())
-    return path
-
-
-def record(
-    path: Path,
-    sequence: PatternSequence,
-    frames: np.ndarray,
-    scans: int = 1,
-    without: tuple[int, int] | None = None,
-    rig: Rig | None = None,
-    pose_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> Path:
-    """Record scans; one image may be missing, the stage may move after the first pattern."""
-    with new_bag(path) as bag:
-        if rig is not None:
-            bag.calibration(Calibration(rig), "true", START_NS)
-        for scan in range(1, scans + 1):
-            start_ns = START_NS + scan * 2_000_000_000
-            bag.pose((0.0, 0.0, 0.0), start_ns - FRAME_NS)
-            for i, frame in enumerate(frames):
-                stamp_ns = start_ns + i * FRAME_NS
-                bag.trigger(sequence, i, scan, stamp_ns, 0.01)
-                if (scan, i) != without:
-                    bag.image(frame, stamp_ns, stamp_ns + 12_000_000)
-                bag.pose(pose_m, stamp_ns + 13_000_000)
-            bag.pose(pose_m, start_ns + len(frames) * FRAME_NS)
     return path
 
 

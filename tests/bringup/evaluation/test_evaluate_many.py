@@ -3,29 +3,30 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sl_bringup.bag.bag_writer import BagWriter, new_bag
-from sl_bringup.bag.bags import make_message
-from sl_bringup.cli.main import main
+from sl_bringup.bag.bag_writer import new_bag
 from sl_bringup.evaluation.sweep import variants
 from sl_common.errors import ConfigError
-from sl_common.topics import REPORT, SETTINGS
+from sl_common.topics import REPORT
 from sl_reconstruct.decode.settings import Settings
-from sl_reconstruct.messages import report_to_msg
 from sl_reconstruct.model.calibration_file import Calibration, save_calibration
 from sl_reconstruct.model.rig import Rig
-from sl_reconstruct.scan.scan_summary import ScanSummary
 from support.scenes.rigs import tiny_rig
+from support.scenes.tiny_bags import (
+    START_NS,
+    evaluate,
+    live_report,
+    record_stacks,
+    summary,
+    write_scans,
+)
 from support.scenes.tiny_scans import render, tiny_sequence
 
-START_NS = 1_700_000_000_000_000_000
-FRAME_NS = 20_000_000
 SEEDS = (1, 2, 3, 4)
 
 
@@ -35,46 +36,8 @@ def stacks() -> list[np.ndarray]:
     return [render(tiny_sequence("precise"), seed) for seed in SEEDS]
 
 
-def write_scans(bag: BagWriter, stacks: Sequence[np.ndarray]) -> None:
-    sequence = tiny_sequence("precise")
-    for scan, frames in enumerate(stacks, start=1):
-        start_ns = START_NS + scan * 2_000_000_000
-        bag.pose((0.0, 0.0, 0.0), start_ns - FRAME_NS)
-        for i, frame in enumerate(frames):
-            stamp_ns = start_ns + i * FRAME_NS
-            bag.trigger(sequence, i, scan, stamp_ns, 0.01)
-            bag.image(frame, stamp_ns, stamp_ns + 12_000_000)
-        bag.pose((0.0, 0.0, 0.0), start_ns + len(frames) * FRAME_NS)
-
-
-def record(
-    path: Path, stacks: Sequence[np.ndarray], rig: Rig | None = None, settings: str = ""
-) -> Path:
-    with new_bag(path) as bag:
-        bag.calibration(Calibration(rig or tiny_rig()), "true", START_NS)
-        if settings:
-            message = make_message(SETTINGS.msgtype, data=settings)
-            bag.write(SETTINGS, START_NS, message)
-        write_scans(bag, stacks)
-    return path
-
-
-def evaluate(*arguments: str | Path) -> int:
-    return main(["evaluate", *map(str, arguments)])
-
-
-def summary(folder: Path) -> dict:
-    return json.loads((folder / "summary.json").read_text())
-
-
-def live_report(scan_id: int, cloud_hash: str, settings_hash: str, calibration_hash: str) -> object:
-    hashes = {"cloud_hash": cloud_hash, "settings_hash": settings_hash}
-    summary = ScanSummary(scan_id, "precise", calibration_hash=calibration_hash, **hashes)
-    return report_to_msg(summary, make_message)
-
-
 def test_threads_change_nothing(tmp_path: Path, stacks: list[np.ndarray]) -> None:
-    bag = record(tmp_path / "bag", stacks)
+    bag = record_stacks(tmp_path / "bag", stacks)
     for jobs in (1, 3):
         out = tmp_path / f"{jobs}"
         assert evaluate(bag, "--output", out, "--pictures", "none", "--jobs", jobs) == 0
@@ -91,7 +54,10 @@ def test_threads_change_nothing(tmp_path: Path, stacks: list[np.ndarray]) -> Non
 def test_several_bags_and_one_that_is_none(
     tmp_path: Path, stacks: list[np.ndarray], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    first, second = record(tmp_path / "a", stacks[:2]), record(tmp_path / "b", stacks[2:])
+    first, second = (
+        record_stacks(tmp_path / "a", stacks[:2]),
+        record_stacks(tmp_path / "b", stacks[2:]),
+    )
     bad = tmp_path / "c.mcap"
     bad.write_bytes(b"no bag")
     out = tmp_path / "out"
@@ -104,13 +70,13 @@ def test_several_bags_and_one_that_is_none(
 
 
 def test_a_bag_named_twice_is_refused(tmp_path: Path, stacks: list[np.ndarray]) -> None:
-    bag = record(tmp_path / "a", stacks[:1])
+    bag = record_stacks(tmp_path / "a", stacks[:1])
     assert evaluate(bag, bag, "--output", tmp_path / "out") == 1
     assert not (tmp_path / "out").exists()
 
 
 def test_pictures_of_the_first_scan_only(tmp_path: Path, stacks: list[np.ndarray]) -> None:
-    bag = record(tmp_path / "bag", stacks[:2])
+    bag = record_stacks(tmp_path / "bag", stacks[:2])
     assert evaluate(bag, "--output", tmp_path / "out", "--pictures", "first") == 0
     pictures = sorted(p.parent.name for p in tmp_path.glob("out/scan_*/picture_*.png"))
     assert pictures == ["scan_0001"] * 6
@@ -120,7 +86,7 @@ def test_pictures_of_the_first_scan_only(tmp_path: Path, stacks: list[np.ndarray
 def test_a_sweep_compares_settings(
     tmp_path: Path, stacks: list[np.ndarray], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bag, out = record(tmp_path / "bag", stacks[:2]), tmp_path / "out"
+    bag, out = record_stacks(tmp_path / "bag", stacks[:2]), tmp_path / "out"
     assert evaluate(bag, "--output", out, "--sweep", "estimator=matched,cubic") == 0
     table = json.loads((out / "sweep.json").read_text())["variants"]
     assert [row["settings"] for row in table] == [["estimator=matched"], ["estimator=cubic"]]
@@ -161,7 +127,7 @@ def test_sweeps_that_make_no_sense(sweeps: list[str]) -> None:
 def test_a_sweep_of_an_unknown_setting_begins_nothing(
     tmp_path: Path, stacks: list[np.ndarray]
 ) -> None:
-    bag = record(tmp_path / "bag", stacks[:1])
+    bag = record_stacks(tmp_path / "bag", stacks[:1])
     assert evaluate(bag, "--output", tmp_path / "out", "--sweep", "estimator=matched,best") == 1
     assert not (tmp_path / "out").exists()
 
@@ -170,7 +136,7 @@ def test_live_hashes_prove_or_disprove(
     tmp_path: Path, stacks: list[np.ndarray], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A scan with the live hash, one with another, one made with other settings, one unknown."""
-    plain = record(tmp_path / "plain", stacks)
+    plain = record_stacks(tmp_path / "plain", stacks)
     evaluate(plain, "--output", tmp_path / "0", "--pictures", "none")
     known = summary(tmp_path / "0")["scans"]
     assert summary(tmp_path / "0")["live"] == {"same": 0, "different": 0, "unknown": 4}
@@ -197,7 +163,7 @@ def test_the_recorded_settings_hold_unless_changed(
     tmp_path: Path, stacks: list[np.ndarray]
 ) -> None:
     recorded = json.dumps({**Settings(estimator="cubic", min_light=0.2).to_dict()})
-    bag = record(tmp_path / "bag", stacks[:1], settings=recorded)
+    bag = record_stacks(tmp_path / "bag", stacks[:1], settings=recorded)
     evaluate(bag, "--output", tmp_path / "1", "--pictures", "none")
     evaluate(bag, "--output", tmp_path / "2", "--pictures", "none", "--set", "estimator=matched")
     hashes = [summary(tmp_path / n)["scans"][0]["settings_hash"] for n in ("1", "2")]
@@ -209,7 +175,7 @@ def test_the_recorded_settings_hold_unless_changed(
 def test_recorded_settings_of_another_version_are_told(
     tmp_path: Path, stacks: list[np.ndarray]
 ) -> None:
-    bag = record(tmp_path / "bag", stacks[:1], settings='{"quantum_level": 3}')
+    bag = record_stacks(tmp_path / "bag", stacks[:1], settings='{"quantum_level": 3}')
     assert evaluate(bag, "--output", tmp_path / "out", "--pictures", "none") == 0
     found = summary(tmp_path / "out")
     assert found["scans"][0]["settings_hash"] == Settings().hash()
@@ -222,7 +188,7 @@ def test_another_calibration_than_the_bags_is_said_aloud(
     rig = tiny_rig()
     projector = replace(rig.projector, translation_m=rig.projector.translation_m + 1e-6)
     moved = Rig(rig.camera, projector)
-    bag = record(tmp_path / "bag", stacks[:1], rig=moved)
+    bag = record_stacks(tmp_path / "bag", stacks[:1], rig=moved)
     save_calibration(tmp_path / "cal.yaml", rig)
     arguments = ("--output", tmp_path / "out", "--pictures", "none")
     evaluate(bag, *arguments, "--calibration", tmp_path / "cal.yaml")

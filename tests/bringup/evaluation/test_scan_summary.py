@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_evaluate import record
 
 from sl_bringup.bag.bags import make_message
 from sl_bringup.cli.main import main
@@ -21,6 +20,7 @@ from sl_reconstruct.model.calibration_file import Calibration
 from sl_reconstruct.reconstruction.reconstructor_cache import Workshop
 from sl_reconstruct.scan.scan_summary import ScanSummary
 from support.scenes.rigs import tiny_rig
+from support.scenes.tiny_bags import record
 from support.scenes.tiny_scans import render, tiny_sequence
 
 
