@@ -50,7 +50,7 @@ def row_of(u_px: Array, level_dn: Array | float = 200.0) -> Lines:
 def widened(t: Tuning, row: Lines) -> NDArray[np.float32]:
     """Sigma with bends and uneven light; that of noise alone stays as it is."""
     wide_px, noise_px = np.empty_like(row.sigma_px), row.sigma_px.copy()
-    widen_edges(t, row, wide_px)
+    widen_edges(t, row.u_px, row.level_dn, row.sigma_px, wide_px)
     np.testing.assert_array_equal(row.sigma_px, noise_px)
     return wide_px
 

@@ -124,16 +124,13 @@ def edge_filter(plan: AxisPlan, matched: bool, blur_px: float, scale: float) -> 
         gaussian_taps(sd, min(MAX_RADIUS_PX, int(np.ceil(3 * sd)))) if matched else np.ones(1)
         for sd in (max(0.4, min(blur_px, STRIPE_PART * w)) for w in stripes)
     ]
-    radius = max(k.size for k in kernels)
-    padded = np.array([np.pad(k, (0, radius - k.size)) for k in kernels])
-    tables = {
-        k.tobytes(): noise_gain(k, blur_px) for k in {k.tobytes(): k for k in kernels}.values()
-    }
-    gain = [tables[k.tobytes()] for k in kernels] + [bar_gain()]
+    taps = np.zeros((len(kernels), max(k.size for k in kernels)), np.float32)
+    for row, k in zip(taps, kernels, strict=True):
+        row[: k.size] = k
+    different = {k.tobytes(): k for k in kernels}
+    gains = {key: noise_gain(k, blur_px) for key, k in different.items()}
+    gain = [gains[k.tobytes()] for k in kernels] + [bar_gain()]
     total = [float(np.sqrt(blur_px**2 + tap_variance(k))) for k in kernels]
     slope = [stripe_slope(w, s) for w, s in zip(stripes, total, strict=True)]
     slope.append(bar_slope(min(stripes), blur_px))
-    return Filter(
-        padded.astype(np.float32),
-        np.array(gain, np.float32), np.array(slope, np.float32),
-    )  # fmt: skip
+    return Filter(taps, np.array(gain, np.float32), np.array(slope, np.float32))

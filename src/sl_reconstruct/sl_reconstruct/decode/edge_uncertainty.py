@@ -132,7 +132,9 @@ def _beyond(change: Real, noise: Real, apart: Real) -> Real:
 
 
 @kernel()
-def widen_edges(t: Tuning, line: Lines, wide_px: Floats) -> None:
+def widen_edges(
+    t: Tuning, u_px: Floats, level_dn: Floats, sigma_px: Floats, wide_px: Floats
+) -> None:
     """Write a row's sigma, wider where light is uneven or the surface bends under an edge.
 
     Light that changes by the part g per pixel moves an edge by g times the square of the lens's
@@ -148,12 +150,12 @@ def widen_edges(t: Tuning, line: Lines, wide_px: Floats) -> None:
     ----------
     t : Tuning
         Has blur, scale and pixel noise.
-    line : Lines
-        The row; its sigma is that of noise alone.
+    u_px, level_dn, sigma_px : ndarray, (boundaries,)
+        Of the row, as in `Lines`; this sigma is that of noise alone.
     wide_px : ndarray, (boundaries,)
         Written to, camera pixels.
     """
-    u_px, level_dn, sigma_px, n = line.u_px, line.level_dn, line.sigma_px, line.u_px.size
+    n = u_px.size
     wide_px[:2], wide_px[n - 2 :] = sigma_px[:2], sigma_px[n - 2 :]
     f, one, half, side = np.float32, np.float32(1), np.float32(0.5), np.float32(SIDE_NOISE)
     light_px4, bent_px = f(t.blur_px**4), f((0.5 * t.blur_px / t.scale) ** 4)

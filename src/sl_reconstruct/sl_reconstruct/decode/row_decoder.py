@@ -154,31 +154,6 @@ def _settle(owner: Integers, s: int, r: SourceRow, first: int, n: int, out: Line
 
 
 @kernel(forceinline=True)
-def _edges(d: Decoding, y: int, s: int, scratch: RowScratch, out: Lines) -> None:
-    """Find and identify the edges of one source."""
-    p, r, t, f, source = scratch.pixels, scratch.source, d.tuning, d.filters, d.plan.sources[s]
-    pattern, inverse = d.stack[source[IMAGE], y], d.stack[max(0, source[INVERSE]), y]
-    margin = f.taps.shape[1] + t.reach_px  # neither filter nor threshold reach beyond the image
-    count = find_crossings(p.lit, r.filtered, r.at, margin, r.filtered.size - margin - 1)
-    pair, tile = source[INVERSE] >= 0, r.tile
-    for first in range(0, count, TILE):
-        n = min(TILE, count - first)
-        gather(p, r, first, n, t)
-        find_zeros(tile, n)
-        identify(tile, n, source[RISING], source[HALF_PERIOD], False, t)
-        refuse_dim_edges(tile, n, t)
-        look_up_gain(tile, n, f.gain[s])
-        if pair:
-            gather_pair(pattern, inverse, r, first, n)
-            weigh_pairs(tile, n, f.slope[s], t)
-        else:
-            gather_single(p, r, first, n)
-            weigh_singles(tile, n, f.slope[s], False, t)
-        judge(tile, n, t.least_width, t.most_width, out.tally[s])
-        _settle(d.plan.edge_owner, s, r, first, n, out)
-
-
-@kernel(forceinline=True)
 def _bars(d: Decoding, s: int, scratch: RowScratch, out: Lines) -> None:
     """Find and identify the centres of one source by BR8's zero crossings, Eq. (6)."""
     p, r, t, f, source = scratch.pixels, scratch.source, d.tuning, d.filters, d.plan.sources[s]
@@ -201,16 +176,33 @@ def _bars(d: Decoding, s: int, scratch: RowScratch, out: Lines) -> None:
 
 @kernel(forceinline=True)
 def _source(d: Decoding, y: int, s: int, scratch: RowScratch, out: Lines) -> None:
-    """Everything that one source gives in one row."""
-    r, source, floor_dn = scratch.source, d.plan.sources[s], d.tuning.floor_dn
+    """Find and identify the edges of one source in one row, and its centres by BR8."""
+    p, r, t, f, source = scratch.pixels, scratch.source, d.tuning, d.filters, d.plan.sources[s]
     pattern, inverse = d.stack[source[IMAGE], y], d.stack[max(0, source[INVERSE]), y]
-    if source[INVERSE] >= 0:
-        pair_signal(pattern, inverse, floor_dn, r.signal)
+    pair, tile, tally = source[INVERSE] >= 0, r.tile, out.tally[s]
+    if pair:
+        pair_signal(pattern, inverse, t.floor_dn, r.signal)
     else:
-        single_signal(pattern, scratch.pixels, floor_dn, r.signal)
-    smooth(r.signal, d.filters.taps[s], r.filtered)
-    out.tally[s] = 0
-    _edges(d, y, s, scratch, out)
+        single_signal(pattern, p, t.floor_dn, r.signal)
+    smooth(r.signal, f.taps[s], r.filtered)
+    tally[:] = 0
+    margin = f.taps.shape[1] + t.reach_px  # neither filter nor threshold reach beyond the image
+    count = find_crossings(p.lit, r.filtered, r.at, margin, r.filtered.size - margin - 1)
+    for first in range(0, count, TILE):
+        n = min(TILE, count - first)
+        gather(p, r, first, n, t)
+        find_zeros(tile, n)
+        identify(tile, n, source[RISING], source[HALF_PERIOD], False, t)
+        refuse_dim_edges(tile, n, t)
+        look_up_gain(tile, n, f.gain[s])
+        if pair:
+            gather_pair(pattern, inverse, r, first, n)
+            weigh_pairs(tile, n, f.slope[s], t)
+        else:
+            gather_single(p, r, first, n)
+            weigh_singles(tile, n, f.slope[s], False, t)
+        judge(tile, n, t.least_width, t.most_width, tally)
+        _settle(d.plan.edge_owner, s, r, first, n, out)
     if d.bars and source[CENTRES]:
         bar_centres(r.signal, r.filtered)
         _bars(d, s, scratch, out)

@@ -153,10 +153,9 @@ def check_phase(u_px: NDArray[np.float32], owner: NDArray[np.int64], images: lis
     off = (u_px[:, 1:-1] - (u_px[:, 2:] + u_px[:, :-2]) / 2) / np.where(span == 0, np.nan, span) * 2
     for i, image in enumerate(images):
         mine = off[:, owner[1:-1] == i]
-        mine = mine[np.isfinite(mine)]
-        if mine.size >= 32 and abs(float(np.median(mine))) > MAX_PHASE:
+        middle = median(mine) if np.count_nonzero(np.isfinite(mine)) >= 32 else 0.0
+        if abs(middle) > MAX_PHASE:
             raise StackError(
-                f"image {image}: its edges lie {float(np.median(mine)):+.2f} DMD pixels off the "
-                f"middle of their neighbours; expected at most {MAX_PHASE}: images are exchanged "
-                f"or repeated"
+                f"image {image}: its edges lie {middle:+.2f} DMD pixels off the middle of their "
+                f"neighbours; expected at most {MAX_PHASE}: images are exchanged or repeated"
             )

@@ -10,7 +10,7 @@ from sl_common.kernel_cache import kernel
 from sl_reconstruct.cloud.refusals import Reason
 from sl_reconstruct.decode.edge_uncertainty import widen_edges
 from sl_reconstruct.decode.edges import PRESENT, Tuning
-from sl_reconstruct.decode.types import Bytes, Floats, Lines, line_at
+from sl_reconstruct.decode.types import Bytes, Floats, Lines
 from sl_reconstruct.model.geometry import (
     DEPTH,
     DZ,
@@ -235,19 +235,20 @@ def screen_row(job: Triangulation, y: int, out: Output, s: Scratch) -> None:
         bends and uneven light do.
     """
     lines, bad, nan = job.lines, s.around.bad, np.float32(np.nan)
-    line = line_at(lines, y)
-    widen_edges(job.tuning, line, s.sigma_px)
+    u, reason, at, found = out.u_px[y], out.reason[y], lines.u_px[y], lines.reason[y]
+    widen_edges(job.tuning, at, lines.level_dn[y], lines.sigma_px[y], s.sigma_px)
     find_steps(lines.u_px, y, job.screen, s.around)
-    u, reason, at, found = out.u_px[y], out.reason[y], line.u_px, line.reason
     for k in range(u.size):
         u[k] = nan if bad[k] else at[k]
         reason[k] = np.uint8(STEP) if (bad[k] != 0) & (found[k] == PRESENT) else found[k]
 
 
 @kernel(forceinline=True)
-def _write(r: Array, sigma_px: Floats, level: Floats, row: Output) -> None:
+def _write(
+    r: Array, sigma_px: Floats, level: Floats, values: Floats, u: Floats, reason: Bytes
+) -> None:
     """Write the solved part of a row; NaN where there is no point."""
-    values, u, reason, nan = row.values, row.u_px, row.reason, np.float32(np.nan)
+    nan = np.float32(np.nan)
     for k in range(u.size):
         if reason[k] == PRESENT and r[DEPTH + k] > 0:
             values[k, 0] = r[PX + k]
@@ -278,13 +279,14 @@ def triangulate_rows(job: Triangulation, first: int, last: int, out: Output, s: 
     s : Scratch
         Made by `triangulation_scratch`, one for each thread.
     """
-    r, g, level = s.rays, job.geometry, job.lines.level_dn
+    g, columns, level_dn = job.geometry, job.columns, job.lines.level_dn
+    r, sigma_px = s.rays, s.sigma_px
     for y in range(first, last):
         screen_row(job, y, out, s)
-        u, reason, values = out.u_px[y], out.reason[y], out.values[y]
+        u, reason, values, level = out.u_px[y], out.reason[y], out.values[y], level_dn[y]
         for a in range(0, u.size, RAYS):
             b = min(a + RAYS, u.size)
             camera_rays(g, u[a:b], float(y), r)
-            solve_slopes(g, job.columns[a:b], r)
+            solve_slopes(g, columns[a:b], r)
             solve_points(g, b - a, r)
-            _write(r, s.sigma_px[a:b], level[y, a:b], Output(values[a:b], u[a:b], reason[a:b]))
+            _write(r, sigma_px[a:b], level[a:b], values[a:b], u[a:b], reason[a:b])
