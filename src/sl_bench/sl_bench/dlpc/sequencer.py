@@ -38,7 +38,7 @@ class Program:
     """What a start command starts."""
 
     slots: tuple[Slot, ...]
-    #: Patterns to show; 0 repeats the table for ever.
+    #: Patterns to show; 0 repeats the table until it is stopped.
     exposures: int
     #: Exposure to begin with, after a pause.
     first: int

@@ -1,7 +1,7 @@
 """USB's side of an emulated HID device.
 
-Reports queued for the host, faults of the bus, and a server that lends the device to another
-process over a Unix socket (`sl_projector.hid.usb_socket`).
+Reports queued for the host, faults of the bus, and a server through which another process
+uses the device over a Unix socket (`sl_projector.hid.usb_socket`).
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class EmulatedUsb:
             self.ready.notify_all()
 
     def plug_in(self) -> None:
-        """Put it back; hosts must open it anew."""
+        """Put it back; hosts must open it again."""
         with self.ready:
             self.device.forget_message()
             self.replies.clear()

@@ -85,7 +85,7 @@ class SerialEmulator(ABC):
         self._relink()
 
     def disconnect(self) -> None:
-        """Pull the cable: whoever has the port open gets an error, the links are gone."""
+        """Pull the cable: a host with the port open gets an error, the links are gone."""
         with self._cable:
             if self._master < 0:
                 return

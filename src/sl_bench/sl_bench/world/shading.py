@@ -16,7 +16,7 @@ from sl_reconstruct.model.rig import Rig
 
 #: Map coordinate of a sample that sees no lit surface.
 NOWHERE_PX = -1e6
-#: Blur beyond this is not told apart, pixels.
+#: Largest blur, pixels; more is taken for this.
 MAX_BLUR_PX = 5.0
 #: DMD pixels per camera pixel beyond which a map's gradient is a jump, not a slope.
 MAX_GRADIENT = 6.0

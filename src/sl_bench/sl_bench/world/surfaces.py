@@ -380,7 +380,7 @@ def height_map(
     step_m : float, optional
         Distance of neighbours; a TMD file has its own.
     unit_m : float
-        What one unit of height is; a TMD file is in millimetres whatever this says.
+        What one unit of height is; ignored for a TMD file, which is in millimetres.
 
     Raises
     ------
