@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sl_bench.world.optics import Optics
 from sl_bench.world.surfaces import make_surface
 from sl_bench.world.world import World
-from sl_bringup.cli.calibrate import outcome_lines
+from sl_bringup.results.calibration_lines import outcome_lines
 from sl_bringup.results.paper_tables import table_1_lines
 from sl_calibration.data.observations import load_observations
 from sl_calibration.data.run_store import CALIBRATION, OBSERVATIONS, Store

@@ -42,17 +42,14 @@ def add_parser(subparsers: Any) -> None:
     """Register ``slrig doctor``."""
     parser = subparsers.add_parser(
         "doctor",
-        help="say what is missing on this machine, and what to do",
         description="Check Python, libraries, ROS, shared memory, configuration, devices and the "
         "running graph. Devices are asked how they are and never moved; those of a running graph "
         "are left alone: its nodes report. (An Arduino at a serial port restarts when opened.) "
         "With --bench nothing about hardware is asked for. The exit status is 0 when nothing that "
         "is needed is missing.",
         epilog="examples:\n  slrig doctor --bench\n  slrig doctor --config my_rig.yaml",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_graph_arguments(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sl_bringup.bag.bag_writer import BagWriter, Storage, new_bag
 from sl_bringup.bag.bags import natural_key
+from sl_bringup.cli.patterns import dmd_size
 from sl_bringup.graph.console import ProgressLine, say
 from sl_common.errors import StackError
 from sl_projector.sequence.sequence_file import SequenceFile, find_sequence
@@ -221,35 +222,21 @@ def add_parser(subparsers: Any) -> None:
     """Register ``slrig import``."""
     parser = subparsers.add_parser(
         "import",
-        help="make a recording of a folder of images",
         description="Make a rosbag2 recording of a folder of images, in natural order of their "
         "names, one per pattern. A folder with sub-folders is several scans.",
         epilog="examples:\n"
         "  slrig import shots --sequence precise --output shots_bag\n"
         "  slrig import board --sequence examples/procam_board.yaml --output board_bag "
         "--calibration calibration.json",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("folder", type=Path, metavar="DIR", help="folder of images")
-    parser.add_argument("--sequence", required=True, metavar="NAME|FILE", help="what was projected")
-    parser.add_argument("--output", required=True, type=Path, metavar="BAG", help="bag to be made")
-    parser.add_argument("--storage", choices=("mcap", "sqlite3"), default="mcap")
-    parser.add_argument(
-        "--calibration", type=Path, metavar="FILE", help="store this calibration in the bag"
-    )
-    parser.add_argument(
-        "--dmd-size",
-        type=_dmd_size,
-        metavar="WxH",
-        help="DMD columns x rows of a built-in sequence (default 1024x768)",
-    )
-    parser.set_defaults(run=run)
-
-
-def _dmd_size(text: str) -> tuple[int, int]:
-    from sl_bringup.cli.patterns import dmd_size
-
-    return dmd_size(text)
+    add = parser.add_argument
+    add("folder", type=Path, metavar="DIR", help="folder of images")
+    add("--sequence", required=True, metavar="NAME|FILE", help="what was projected")
+    add("--output", required=True, type=Path, metavar="BAG", help="bag to be made")
+    add("--storage", choices=("mcap", "sqlite3"), default="mcap")
+    add("--calibration", type=Path, metavar="FILE", help="store this calibration in the bag")
+    text = "DMD columns x rows of a built-in sequence (default 1024x768)"
+    add("--dmd-size", type=dmd_size, metavar="WxH", help=text)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -28,7 +28,7 @@ COMMANDS = {
     "import": "make a recording of a folder of images",
     "record": "record what an evaluation needs",
     "replay": "publish a recording as the devices did",
-    "repair": "make a whole recording of what is readable",
+    "repair": "make a complete recording of what is readable",
     "evaluate": "recordings to clouds, reports and pictures",
     "measure": "measure a cloud: planes, angles, steps, roughness, ...",
 }

@@ -18,33 +18,31 @@ def add_parser(subparsers: Any) -> None:
     """Register ``slrig record``."""
     parser = subparsers.add_parser(
         "record",
-        help="record what an evaluation needs",
         description="Record triggers, images, poses, calibration, settings and results of the "
         "running graph until Ctrl-C, as rosbag2 (mcap). What is older than a second is safe even "
-        "when the recorder is killed; `slrig repair` makes a whole recording of what it left. The "
-        "exit status is 0 only when nothing was lost.",
+        "when the recorder is killed; `slrig repair` makes a complete recording of what it left. "
+        "The exit status is 0 only when nothing was lost.",
         epilog="examples:\n"
         "  slrig record --output bag\n"
         "  slrig record --output bag --split 2GB\n"
         "  slrig record --output everything --all",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--output", required=True, type=Path, metavar="BAG", help="bag to be made")
-    parser.add_argument(
-        "--all",
-        action="store_true",
-        help="every topic, stacks and clouds included: 2.5 times as much",
-    )
-    parser.add_argument(
-        "--split", default="0", metavar="SIZE", help="begin another file after so much: 500MB, 2GB"
+    add = parser.add_argument
+    add("--output", required=True, type=Path, metavar="BAG", help="bag to be made")
+    text = "every topic, stacks and clouds included: 2.5 times as much"
+    add("--all", action="store_true", help=text)
+    add(
+        "--split",
+        default="0",
+        metavar="SIZE",
+        help="begin another file after this much: 500MB, 2GB",
     )
     text = (
         "images too (zstd): 10 %% smaller where all is lit, 40 %% where half is not, for 7 ms of a "
         "core per 2 MB; small messages always are"
     )
-    parser.add_argument("--compress", action="store_true", help=text)
+    add("--compress", action="store_true", help=text)
     add_client_arguments(parser)
-    parser.set_defaults(run=run)
 
 
 #: Smaller files would hold one message or two each.

@@ -23,17 +23,15 @@ def add_parser(subparsers: Any) -> None:
     """Register ``slrig repair``."""
     parser = subparsers.add_parser(
         "repair",
-        help="make a whole recording of what is readable",
         description="Copy everything that can be read of a recording, whose recorder was killed "
         "or whose files are damaged, into a new one, which any reader of rosbag2 takes. The old "
         "one is not touched. `slrig evaluate` needs no repair: it reads what is there. The exit "
         "status is 0 when the new recording is written, whatever the old one had lost.",
         epilog="example:\n  slrig repair killed_bag --output whole_bag",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 directory, .mcap or .db3")
-    parser.add_argument("--output", required=True, type=Path, metavar="BAG", help="bag to be made")
-    parser.set_defaults(run=run)
+    add = parser.add_argument
+    add("bag", type=Path, metavar="BAG", help="rosbag2 directory, .mcap or .db3")
+    add("--output", required=True, type=Path, metavar="BAG", help="bag to be made")
 
 
 def run(args: argparse.Namespace) -> int:

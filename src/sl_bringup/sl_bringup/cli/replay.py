@@ -16,33 +16,29 @@ def add_parser(subparsers: Any) -> None:
     """Register ``slrig replay``."""
     parser = subparsers.add_parser(
         "replay",
-        help="publish a recording as the devices did",
         description="Publish triggers, images, poses and calibration of a recording with their "
         "timing, and the time on /clock. It begins when somebody listens. Nodes that are to live "
-        "in the recording's time get use_sim_time. A calibration in force in the graph stays so, "
-        "and the recording's is not played. synchronizer and reconstruct make stacks and "
+        "in the recording's time get use_sim_time. A calibration that is in force in the graph "
+        "stays, and the recording's is not played. synchronizer and reconstruct make stacks and "
         "clouds of a replay as of a live scan; nobody asked for them by `slrig scan`, so "
         "reconstruct makes them only while somebody subscribes to reconstruct/points. Do not "
         "replay into a graph whose own devices run. The exit status is 0 only when the bag was "
-        "whole and everything reached its listeners.",
+        "complete and everything reached its listeners.",
         epilog="examples:\n"
         "  slrig replay bag\n"
         "  slrig replay bag --rate 4 --domain 7\n"
         "  slrig replay bag --all --wait 30",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 directory, .mcap or .db3")
-    parser.add_argument("--rate", type=float, default=1.0, help="times as fast (default: 1)")
-    parser.add_argument(
-        "--all", action="store_true", help="verdicts and reports as well, not only the devices'"
-    )
+    add = parser.add_argument
+    add("bag", type=Path, metavar="BAG", help="rosbag2 directory, .mcap or .db3")
+    add("--rate", type=float, default=1.0, help="times as fast (default: 1)")
+    add("--all", action="store_true", help="verdicts and reports as well, not only the devices'")
     text = (
         "longest wait for listeners at the start, and for their acknowledgements at the end; "
         "0: none (default: 10)"
     )
-    parser.add_argument("--wait", type=float, default=10.0, metavar="S", help=text)
+    add("--wait", type=float, default=10.0, metavar="S", help=text)
     add_client_arguments(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

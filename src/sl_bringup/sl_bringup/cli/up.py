@@ -21,17 +21,14 @@ _ResultT = TypeVar("_ResultT")
 
 def add_graph_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments that say which graph is meant and how it is started."""
-    parser.add_argument("--bench", action="store_true", help="simulated bench, no hardware")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="ROS parameter file")
-    parser.add_argument("--calibration", type=Path, metavar="FILE", help="calibration of the rig")
-    parser.add_argument(
-        "--surface", default="", help="part on the bench (groove, coin, plate, ...)"
-    )
+    add = parser.add_argument
+    add("--bench", action="store_true", help="simulated bench, no hardware")
+    add("--config", type=Path, metavar="FILE", help="ROS parameter file")
+    add("--calibration", type=Path, metavar="FILE", help="calibration of the rig")
+    add("--surface", default="", help="part on the bench (groove, coin, plate, ...)")
     add_domain_arguments(parser)
     text = "all that follows is passed on to every node"
-    parser.add_argument(
-        "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...", help=text
-    )
+    add("--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...", help=text)
 
 
 def add_client_options(parser: argparse.ArgumentParser, timeout_s: float) -> None:
@@ -176,7 +173,6 @@ def add_parser(subparsers: Any) -> None:
     """Register ``slrig up``."""
     parser = subparsers.add_parser(
         "up",
-        help="start the node graph and supervise it",
         description="Start every node as a process of its own on one configuration file, restart "
         "one that dies, stop all on Ctrl-C. The exit status is 0 when the graph had been ready "
         "and everything ended cleanly.",
@@ -184,10 +180,8 @@ def add_parser(subparsers: Any) -> None:
         "  slrig up --bench --surface coin\n"
         "  slrig up --config my_rig.yaml --calibration my_rig_calibration.yaml\n"
         "  slrig up --bench --domain 7 --ros-args --log-level debug",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_graph_arguments(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
