@@ -13,9 +13,9 @@ from sl_interfaces.action import Calibrate
 from sl_interfaces.srv import Verify
 
 from sl_bringup.cli.main import parse
-from sl_bringup.cli.up import graph_options
 from sl_bringup.client_node import CONNECT_S, GraphClient, run_client
 from sl_bringup.graph.console import say
+from sl_bringup.graph.graph_arguments import graph_options
 from sl_bringup.results.calibration_lines import outcome_lines
 from sl_bringup.results.paper_tables import table_1_lines
 from sl_common import topics

@@ -15,9 +15,9 @@ from sensor_msgs.msg import Image, PointCloud2
 from sl_interfaces.action import Scan
 
 from sl_bringup.cli.main import parse
-from sl_bringup.cli.up import graph_options
 from sl_bringup.client_node import CONNECT_S, GraphClient, run_client
 from sl_bringup.graph.console import complain, say
+from sl_bringup.graph.graph_arguments import graph_options
 from sl_bringup.results.live_scan import check_cloud, live_report, summary, write_result
 from sl_common import topics
 from sl_reconstruct.messages import cloud_from_msg, refusals_from_msg, report_from_msg

@@ -8,9 +8,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sl_bringup.cli.up import add_client_options, add_graph_arguments, graph_options, run_client
+from sl_bringup.graph.client_process import run_client
 from sl_bringup.graph.console import complain, say
 from sl_bringup.graph.graph import Graph, GraphOptions, client_command
+from sl_bringup.graph.graph_arguments import (
+    add_graph_arguments,
+    add_waiting_arguments,
+    graph_options,
+)
 from sl_bringup.results.calibration_lines import outcome_lines
 from sl_common.documents import read_document
 from sl_common.errors import ConfigError
@@ -52,7 +57,7 @@ def add_parser(subparsers: Any) -> None:
     add("--sequence", default="", help="patterns, both axes (default: the node's)")
     text = "only check the calibration in force, on the plate or a flat (default: plate)"
     add("--verify", nargs="?", const="plate", choices=["plate", "flat"], help=text)
-    add_client_options(parser, 600.0)
+    add_waiting_arguments(parser, 600.0)
     add_graph_arguments(parser)
 
 

@@ -6,11 +6,11 @@ import argparse
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from sl_bringup.cli.up import add_graph_arguments, graph_options
 from sl_bringup.graph import doctor_checks as checks
 from sl_bringup.graph.console import say
 from sl_bringup.graph.doctor_checks import Finding
 from sl_bringup.graph.graph import GraphOptions, is_running
+from sl_bringup.graph.graph_arguments import add_graph_arguments, graph_options
 
 _MARKS = {"ok": "ok  ", "note": "note", "bad": "BAD "}
 

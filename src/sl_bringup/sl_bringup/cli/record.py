@@ -7,7 +7,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from sl_bringup.graph.client_process import add_client_arguments, become_client, transport_of
+from sl_bringup.graph.client_process import become_client
+from sl_bringup.graph.graph_arguments import add_client_arguments, transport_of
 from sl_common.errors import ConfigError
 
 CLIENT = "sl_bringup.record_node"

@@ -9,8 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from sl_bringup.cli.calibrate import calibrate_bench
-from sl_bringup.cli.up import add_client_options, add_graph_arguments, graph_options, run_client
+from sl_bringup.graph.client_process import run_client
 from sl_bringup.graph.graph import is_running
+from sl_bringup.graph.graph_arguments import (
+    add_graph_arguments,
+    add_waiting_arguments,
+    graph_options,
+)
 from sl_common.errors import ConfigError
 
 CLIENT = "sl_bringup.scan_node"
@@ -37,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
     add("--no-pictures", action="store_true", help="neither pictures nor page")
     text = "with --up --bench: begin with an unknown rig and calibrate it on the hole plate"
     add("--calibrate", action="store_true", help=text)
-    add_client_options(parser, 120.0)
+    add_waiting_arguments(parser, 120.0)
     add_graph_arguments(parser)
 
 
