@@ -64,7 +64,7 @@ def clouds(surface: str) -> Iterator[tuple[World, np.ndarray]]:
 
 def groove() -> np.ndarray:
     found = [measure_groove(points) for _, points in clouds("groove")]
-    return np.array([(m.value - 155.92) / m.uncertainty for m in found if m is not None])
+    return np.array([(m.value - 155.92) / m.uncertainty for m in found])
 
 
 def sphere() -> np.ndarray:

@@ -7,6 +7,7 @@ is the projection, the decoding and the triangulation, not the calibration.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import sys
 import time
@@ -27,7 +28,7 @@ from sl_bench.world.world import World
 from sl_bringup.graph.console import complain, say
 from sl_bringup.results.scan_pictures import relief_picture, section_picture
 from sl_common.documents import written_atomically
-from sl_common.errors import SlError
+from sl_common.errors import SlError, StackError
 from sl_common.json_file import write_json
 from sl_projector.sequence.pattern_sequence import PatternSequence, named
 from sl_reconstruct.cloud.height_map import make_height_map
@@ -110,8 +111,10 @@ def scan(surface: str, name: str) -> tuple[Row, NDArray[Any]]:
 
 
 def _angle(row: Row) -> AngleMeasurement:
-    found = measure_groove(row.points) if row.name != "naive" else None
-    return found or measure_angle(*(select(row.points, flank) for flank in FLANKS))
+    with contextlib.suppress(StackError):
+        if row.name != "naive":
+            return measure_groove(row.points)
+    return measure_angle(*(select(row.points, flank) for flank in FLANKS))
 
 
 def table(rows: Sequence[Row], angles: Sequence[AngleMeasurement]) -> Iterator[str]:

@@ -145,7 +145,8 @@ def test_a_plane_has_no_angle_to_itself_and_a_groove_needs_flanks() -> None:
     m = measure_angle(select(flat), select(flat))
     assert m.value == pytest.approx(180.0)
     assert m.uncertainty > 0.0
-    assert measure_groove(flat) is None
+    with pytest.raises(StackError, match="no groove found"):
+        measure_groove(flat)
 
 
 def test_the_groove_keeps_away_from_its_bends() -> None:
@@ -155,7 +156,7 @@ def test_the_groove_keeps_away_from_its_bends() -> None:
     away = np.minimum(np.abs(bent["x"]), np.abs(np.abs(bent["x"]) - 1.2e-3)) / (4e-3 / columns)
     bent["z"] += 5e-6 * (away < 4.0)
     m = measure_groove(bent)
-    assert m is not None
+    assert m.kind == "angle"
     assert m.set_aside == 0  # the rounded points are not there to be set aside
     # Flanks of 120 columns lose at least 8 at either end: half of the reach of a slope.
     assert 0.5 * 240 * rows < m.points < (240 - 4 * 8) * rows

@@ -14,12 +14,12 @@ from sl_bringup.graph.version import software_version
 from sl_bringup.results.paper_tables import table_2_lines
 from sl_bringup.results.scan_files import write_scan
 from sl_bringup.results.scan_page import included_angle, write_report
+from sl_common.errors import StackError
 from sl_common.pages.page import length
 from sl_reconstruct.cloud.cloud import CLOUD_DTYPE, Cloud
 from sl_reconstruct.cloud.cloud_writer import cloud_hash
 from sl_reconstruct.cloud.refusals import Reason
 from sl_reconstruct.measure.groove import measure_groove
-from sl_reconstruct.measure.plane_angle import AngleMeasurement
 from sl_reconstruct.scan.scan_summary import ScanSummary
 
 MEASURES = ("groove",)
@@ -86,7 +86,7 @@ def _measured(points: NDArray[Any] | None, measure: str) -> dict[str, Any]:
     if points is None:
         return {}
     extents = [float(np.nanmax(v) - np.nanmin(v)) for v in (points["x"], points["y"])]
-    groove = {"groove": _groove(measure_groove(points))} if measure == "groove" else {}
+    groove = {"groove": _groove(points)} if measure == "groove" else {}
     return {"area_m": extents, **groove}
 
 
@@ -118,8 +118,10 @@ def _cloud(
     return Cloud(points, nothing, reason, dict(report["refused"]), report["lit_positions"])
 
 
-def _groove(found: AngleMeasurement | None) -> dict[str, Any]:
-    if found is None:
+def _groove(points: NDArray[Any]) -> dict[str, Any]:
+    try:
+        found = measure_groove(points)
+    except StackError:
         return {"found": False}
     planes = {
         name: {"normal": p.normal, "point_m": p.point_m, "rms_m": p.rms_m, "points": p.points}

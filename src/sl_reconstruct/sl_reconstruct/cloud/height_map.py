@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -143,92 +143,91 @@ def _rasterise(
         if r == 0:
             continue
         for c in range(columns - 1):
-            if not _quad(u, v, w, out, limit_m / step_m, c):
-                _triangle(u, v, w, out, limit_m, step_m, (0, c), (0, c + 1), (1, c))
-                _triangle(u, v, w, out, limit_m, step_m, (1, c + 1), (1, c), (0, c + 1))
+            here = Corner(u[0, c], v[0, c], w[0, c])
+            right = Corner(u[0, c + 1], v[0, c + 1], w[0, c + 1])
+            below = Corner(u[1, c], v[1, c], w[1, c])
+            beyond = Corner(u[1, c + 1], v[1, c + 1], w[1, c + 1])
+            if not _quad(here, right, below, beyond, limit_m / step_m, out):
+                _triangle(here, right, below, limit_m, step_m, out)
+                _triangle(beyond, below, right, limit_m, step_m, out)
+
+
+class Corner(NamedTuple):
+    """A point of the cloud: column and row in units of nodes, height in metres."""
+
+    u: float
+    v: float
+    z: float
+
+
+@kernel(error_model="python", forceinline=True)
+def _area(a: Corner, b: Corner, c: Corner) -> float:
+    """Twice the area of a triangle, with a sign."""
+    return (b.u - a.u) * (c.v - a.v) - (c.u - a.u) * (b.v - a.v)
+
+
+@kernel(error_model="python", forceinline=True)
+def _raise_node(
+    out: NDArray[np.float32], j: int, i: int, a: Corner, b: Corner, c: Corner, area: float
+) -> None:
+    """Give a node the height of a triangle that it lies under, unless it has a greater one."""
+    wb = ((i - a.u) * (c.v - a.v) - (c.u - a.u) * (j - a.v)) / area
+    wc = ((b.u - a.u) * (j - a.v) - (i - a.u) * (b.v - a.v)) / area
+    if wb >= -EDGE and wc >= -EDGE and wb + wc <= 1 + EDGE:
+        height = a.z + wb * (b.z - a.z) + wc * (c.z - a.z)
+        if not out[j, i] >= height:
+            out[j, i] = height
+
+
+@kernel(error_model="python", forceinline=True)
+def _nodes(least: float, most: float, count: int) -> tuple[int, int]:
+    """First node, and the one after the last, of those that lie in a range."""
+    return max(int(np.ceil(least)), 0), min(int(np.floor(most)), count - 1) + 1
 
 
 @kernel(error_model="python")
 def _quad(
-    u: NDArray[np.float64],
-    v: NDArray[np.float64],
-    z: NDArray[np.float64],
-    out: NDArray[np.float32],
-    limit: float,
-    c: int,
+    a: Corner, b: Corner, c: Corner, d: Corner, limit: float, out: NDArray[np.float32]
 ) -> bool:
     """Fill the nodes under the two triangles of a cell at once; false where that cannot be done.
 
     That is where a corner is missing, or the cell is large or flat.
     """
-    ua, ub, uc, ud = u[0, c], u[0, c + 1], u[1, c], u[1, c + 1]
-    va, vb, vc, vd = v[0, c], v[0, c + 1], v[1, c], v[1, c + 1]
-    za, zb, zc, zd = z[0, c], z[0, c + 1], z[1, c], z[1, c + 1]
-    least_u, most_u = min(min(ua, ub), min(uc, ud)), max(max(ua, ub), max(uc, ud))
-    least_v, most_v = min(min(va, vb), min(vc, vd)), max(max(va, vb), max(vc, vd))
-    area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
-    other = (uc - ud) * (vb - vd) - (ub - ud) * (vc - vd)
+    least_u, most_u = min(min(a.u, b.u), min(c.u, d.u)), max(max(a.u, b.u), max(c.u, d.u))
+    least_v, most_v = min(min(a.v, b.v), min(c.v, d.v)), max(max(a.v, b.v), max(c.v, d.v))
+    area, other = _area(a, b, c), _area(d, c, b)
     small = (most_u - least_u <= limit) & (most_v - least_v <= limit)
-    if not (
-        small
-        & (abs(area) >= 1e-12)
-        & (abs(other) >= 1e-12)
-        & (za + zb + zc + zd == za + zb + zc + zd)
-    ):
+    there = a.z + b.z + c.z + d.z == a.z + b.z + c.z + d.z
+    if not (small & (abs(area) >= 1e-12) & (abs(other) >= 1e-12) & there):
         return False
-    for j in range(max(int(np.ceil(least_v)), 0), min(int(np.floor(most_v)), out.shape[0] - 1) + 1):
-        for i in range(
-            max(int(np.ceil(least_u)), 0), min(int(np.floor(most_u)), out.shape[1] - 1) + 1
-        ):
-            wb = ((i - ua) * (vc - va) - (uc - ua) * (j - va)) / area
-            wc = ((ub - ua) * (j - va) - (i - ua) * (vb - va)) / area
-            if wb >= -EDGE and wc >= -EDGE and wb + wc <= 1 + EDGE:
-                height = za + wb * (zb - za) + wc * (zc - za)
-                if not out[j, i] >= height:
-                    out[j, i] = height
-            wb = ((i - ud) * (vb - vd) - (ub - ud) * (j - vd)) / other
-            wc = ((uc - ud) * (j - vd) - (i - ud) * (vc - vd)) / other
-            if wb >= -EDGE and wc >= -EDGE and wb + wc <= 1 + EDGE:
-                height = zd + wb * (zc - zd) + wc * (zb - zd)
-                if not out[j, i] >= height:
-                    out[j, i] = height
+    first_j, last_j = _nodes(least_v, most_v, out.shape[0])
+    first_i, last_i = _nodes(least_u, most_u, out.shape[1])
+    for j in range(first_j, last_j):
+        for i in range(first_i, last_i):
+            _raise_node(out, j, i, a, b, c, area)
+            _raise_node(out, j, i, d, c, b, other)
     return True
 
 
 @kernel(error_model="python")
 def _triangle(
-    u: NDArray[np.float64],
-    v: NDArray[np.float64],
-    z: NDArray[np.float64],
-    out: NDArray[np.float32],
-    limit_m: float,
-    step_m: float,
-    a: tuple[int, int],
-    b: tuple[int, int],
-    c: tuple[int, int],
+    a: Corner, b: Corner, c: Corner, limit_m: float, step_m: float, out: NDArray[np.float32]
 ) -> None:
     """Fill the nodes under one triangle, unless a corner is missing or it is stretched."""
-    if not (np.isfinite(z[a]) and np.isfinite(z[b]) and np.isfinite(z[c])):
+    if not (np.isfinite(a.z) and np.isfinite(b.z) and np.isfinite(c.z)):
         return
     longest = max(
-        max(abs(u[a] - u[b]), abs(u[b] - u[c]), abs(u[c] - u[a])),
-        max(abs(v[a] - v[b]), abs(v[b] - v[c]), abs(v[c] - v[a])),
+        max(abs(a.u - b.u), abs(b.u - c.u), abs(c.u - a.u)),
+        max(abs(a.v - b.v), abs(b.v - c.v), abs(c.v - a.v)),
     )
-    if longest * step_m > limit_m:
+    area = _area(a, b, c)
+    if longest * step_m > limit_m or abs(area) < 1e-12:
         return
-    area = (u[b] - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (v[b] - v[a])
-    if abs(area) < 1e-12:
-        return
-    first_v, last_v = int(np.ceil(min(v[a], v[b], v[c]))), int(np.floor(max(v[a], v[b], v[c])))
-    first_u, last_u = int(np.ceil(min(u[a], u[b], u[c]))), int(np.floor(max(u[a], u[b], u[c])))
-    for j in range(max(first_v, 0), min(last_v, out.shape[0] - 1) + 1):
-        for i in range(max(first_u, 0), min(last_u, out.shape[1] - 1) + 1):
-            wb = ((i - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (j - v[a])) / area
-            wc = ((u[b] - u[a]) * (j - v[a]) - (i - u[a]) * (v[b] - v[a])) / area
-            if wb >= -EDGE and wc >= -EDGE and wb + wc <= 1 + EDGE:
-                height = z[a] + wb * (z[b] - z[a]) + wc * (z[c] - z[a])
-                if not out[j, i] >= height:
-                    out[j, i] = height
+    first_j, last_j = _nodes(min(a.v, b.v, c.v), max(a.v, b.v, c.v), out.shape[0])
+    first_i, last_i = _nodes(min(a.u, b.u, c.u), max(a.u, b.u, c.u), out.shape[1])
+    for j in range(first_j, last_j):
+        for i in range(first_i, last_i):
+            _raise_node(out, j, i, a, b, c, area)
 
 
 def save_tiff(path: str | Path, height: HeightMap) -> None:

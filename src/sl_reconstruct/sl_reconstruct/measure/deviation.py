@@ -35,6 +35,7 @@ class DeviationMeasurement(Measurement):
         Deviation of every point of the cloud, its shape; NaN where there is none.
     """
 
+    kind: str = "deviation"
     form_rms_m: float
     peak_m: float
     valley_m: float
@@ -92,16 +93,9 @@ def measure_deviation(
         found = residual
     form = float(np.mean(residual**2) - np.mean(kept.sigma_m**2))
     return DeviationMeasurement(
-        kind="deviation",
         value=0.0 if level else float(plane[0]),
-        uncertainty=float(np.sqrt(fit.covariance[0, 0])),
-        unit="m",
-        points=len(kept),
-        set_aside=len(chosen) - len(kept),
-        rms_m=fit.rms_m,
-        dof=fit.dof,
-        inflation=fit.inflation,
-        region=region,
+        uncertainty=float(fit.u[0]),
+        **fit.evidence(len(chosen), region),
         form_rms_m=float(np.sqrt(max(form, 0.0))),
         peak_m=float(found.max()),
         valley_m=float(found.min()),

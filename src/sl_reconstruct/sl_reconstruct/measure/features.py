@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from sl_common.errors import ConfigError, StackError
+from sl_common.errors import ConfigError
 from sl_reconstruct.measure.groove import measure_groove
 from sl_reconstruct.measure.hole import measure_hole
 from sl_reconstruct.measure.plane_angle import measure_angle, measure_plane
@@ -51,15 +51,10 @@ def _angle(points: Points, numbers: Numbers) -> Measurement:
 
 
 def _groove(points: Points, numbers: Numbers) -> Measurement:
-    if points.ndim != 2:
-        raise StackError("a groove needs an organised cloud; expected cloud.pcd or height.tiff")
     if numbers:
         points = points.copy()
         points["z"][~Region.of(numbers).contains(points["x"], points["y"])] = math.nan
-    found = measure_groove(points)
-    if found is None:
-        raise StackError("no groove found; expected two flanks of different slope")
-    return found
+    return measure_groove(points)
 
 
 def _profile(points: Points, numbers: Numbers) -> Measurement:

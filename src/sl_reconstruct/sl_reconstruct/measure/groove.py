@@ -25,7 +25,7 @@ NEAR = 0.25
 AWAY = 16
 
 
-def measure_groove(points: NDArray[Any]) -> AngleMeasurement | None:
+def measure_groove(points: NDArray[Any]) -> AngleMeasurement:
     """Find the flanks by their slope along the cloud's rows, and the angle of their planes.
 
     Parameters
@@ -36,9 +36,13 @@ def measure_groove(points: NDArray[Any]) -> AngleMeasurement | None:
 
     Returns
     -------
-    AngleMeasurement or None
-        ``first`` is the flank that falls towards larger x, ``second`` the one that rises. None
-        when there are no two flanks.
+    AngleMeasurement
+        ``first`` is the flank that falls towards larger x, ``second`` the one that rises.
+
+    Raises
+    ------
+    StackError
+        When the cloud is not organised, or has no two flanks.
 
     Examples
     --------
@@ -48,19 +52,22 @@ def measure_groove(points: NDArray[Any]) -> AngleMeasurement | None:
     >>> round(measure_groove(cloud).value, 2)  # 2 atan(5)
     157.38
     """
-    slope = slopes(points)
+    if points.ndim != 2:
+        raise StackError("a groove needs an organised cloud; expected cloud.pcd or height.tiff")
+    slope = _slopes(points)
     there = slope[np.isfinite(slope)]
-    if there.size < 2 * REACH:
-        return None
-    falling, rising = np.quantile(there, [LEAST_PART, 1.0 - LEAST_PART])
-    if rising - falling < LEAST_SLOPE_DIFFERENCE:
-        return None
+    enough = there.size >= 2 * REACH
+    falling, rising = np.quantile(there, [LEAST_PART, 1.0 - LEAST_PART]) if enough else (0.0, 0.0)
     near = NEAR * (rising - falling)
     try:
+        if rising - falling < LEAST_SLOPE_DIFFERENCE:
+            raise StackError("the slopes along its rows are all alike")
         flanks = [select(points, mask=_flank(slope, s, near)) for s in (falling, rising)]
         return measure_angle(*flanks)
-    except StackError:
-        return None
+    except StackError as error:
+        raise StackError(
+            f"no groove found: {error}; expected two flanks of different slope"
+        ) from None
 
 
 def _flank(slope: NDArray[np.float32], wanted: float, near: float) -> NDArray[np.bool_]:
@@ -70,7 +77,7 @@ def _flank(slope: NDArray[np.float32], wanted: float, near: float) -> NDArray[np
     return np.asarray(np.isfinite(slope) & ~bend)
 
 
-def slopes(points: NDArray[Any]) -> NDArray[np.float32]:
+def _slopes(points: NDArray[Any]) -> NDArray[np.float32]:
     """Slope dz/dx along the rows at every point, (H, K); NaN where a neighbour is missing."""
     slope = np.full(points.shape, np.nan, np.float32)
     left, right = points[:, : -2 * REACH], points[:, 2 * REACH :]

@@ -13,9 +13,9 @@ from sl_common.errors import StackError
 from sl_reconstruct.cloud.height_map import typical_spacing_m
 from sl_reconstruct.cloud.plane_fit import TRIM_SD, fit_plane
 from sl_reconstruct.measure.region import Region, Selection
-from sl_reconstruct.measure.result import Fitted, Measurement, Quantity, uncertainties
+from sl_reconstruct.measure.result import Measurement, Quantity
 from sl_reconstruct.measure.roughness import crop
-from sl_reconstruct.measure.sphere_cylinder import fit_rounds
+from sl_reconstruct.measure.sphere_cylinder import Round, fit_rounds
 
 Array = NDArray[np.float64]
 Method = Literal["intensity", "presence"]
@@ -45,6 +45,7 @@ class HoleMeasurement(Measurement):
         part of the strip in which points are refused, which is corrected and in its uncertainty.
     """
 
+    kind: str = "hole"
     centre_m: tuple[float, float]
     u_centre_m: tuple[float, float]
     method: Method
@@ -77,32 +78,25 @@ def measure_hole(points: NDArray[Any], region: Region | None = None) -> HoleMeas
     method: Method = "intensity"
     spacing = typical_spacing_m(cut)
     strip, u_edge = 0.0, U_EDGE_LEVEL * blur
-    values, used, fit = _round(edges, region)
-    if not _is_hole(values, edges, fit, spacing):
+    found = _circle_through(edges, region)
+    if not _is_hole(found, edges, spacing):
         edges, method = _ends(cut), "presence"
         strip = REFUSED_SPACINGS * spacing
         u_edge = strip / 12**0.5
-        values, used, fit = _round(edges, region)
-    if fit is None or not _is_hole(values, edges, fit, REFUSED_SPACINGS * spacing):
-        told = "" if fit is None else f", {1e6 * fit.rms_m:.3g} µm rms off a circle"
+        found = _circle_through(edges, region)
+    if found is None or not _is_hole(found, edges, REFUSED_SPACINGS * spacing):
+        off = "" if found is None else f", {1e6 * found.fit.rms_m:.3g} µm rms off a circle"
         raise StackError(
-            f"{len(edges)} edges in the region{told}; expected one hole with plate around it"
+            f"{len(edges)} edges in the region{off}; expected one hole with plate around it"
         )
-    u = np.sqrt(np.diag(fit.covariance))
+    (x, y, radius), (u_x, u_y, u_radius) = found.values.tolist(), found.fit.u.tolist()
     # The strip's width lies somewhere between 0 and `strip`: its middle, and that of a rectangle.
     return HoleMeasurement(
-        kind="hole",
-        value=float(2.0 * values[2] - strip),
-        uncertainty=float(2.0 * np.hypot(u[2], u_edge)),
-        unit="m",
-        points=int(np.count_nonzero(used)),
-        set_aside=int(np.count_nonzero(~used)),
-        rms_m=fit.rms_m,
-        dof=fit.dof,
-        inflation=fit.inflation,
-        region=region,
-        centre_m=(float(values[0]), float(values[1])),
-        u_centre_m=(float(u[0]), float(u[1])),
+        value=2.0 * radius - strip,
+        uncertainty=float(2.0 * np.hypot(u_radius, u_edge)),
+        **found.fit.evidence(len(edges), region),
+        centre_m=(x, y),
+        u_centre_m=(u_x, u_y),
         method=method,
     )
 
@@ -162,25 +156,24 @@ def _light(points: NDArray[Any]) -> Array:
     return np.asarray(np.where(deep, 0.0, intensity / level))
 
 
-def _round(edges: Array, region: Region | None) -> tuple[Array, NDArray[np.bool_], Fitted | None]:
-    """Circle (x, y, radius), edges used and what they tell; no fit where there are too few."""
+def _circle_through(edges: Array, region: Region | None) -> Round | None:
+    """Circle (x, y, radius) through edges; None where there are too few."""
     if len(edges) < LEAST_EDGES:
-        return np.full(3, np.nan), np.zeros(len(edges), np.bool_), None
+        return None
     flat = Selection(np.column_stack([edges, np.zeros(len(edges))]), np.zeros(len(edges)), region)
     middle = 0.5 * (edges.min(axis=0) + edges.max(axis=0))
     start = np.append(middle, np.median(np.hypot(*(edges - middle).T)))
-    values, used, residual, jacobian, _ = fit_rounds(_circle, flat, start)
-    return values, used, uncertainties(jacobian, residual, flat.sigma_m[used], edges[used])
+    return fit_rounds(_circle, flat, start)
 
 
-def _is_hole(values: Array, edges: Array, fit: Fitted | None, scatter_m: float) -> bool:
+def _is_hole(found: Round | None, edges: Array, scatter_m: float) -> bool:
     """Whether edges scatter little enough, and a circle's centre lies among them: parts of several
     holes do not make one.
     """
-    if fit is None or not np.isfinite(values).all() or fit.rms_m > scatter_m:
+    if found is None or not np.isfinite(found.values).all() or found.fit.rms_m > scatter_m:
         return False
-    low, high = edges.min(axis=0), edges.max(axis=0)
-    return bool(((values[:2] > low) & (values[:2] < high)).all())
+    centre, low, high = found.values[:2], edges.min(axis=0), edges.max(axis=0)
+    return bool(((centre > low) & (centre < high)).all())
 
 
 def _ends(points: NDArray[Any]) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,7 @@ class PlaneMeasurement(Measurement):
         Two directions in the plane, and the covariance of the plane's slopes along them.
     """
 
+    kind: str = "plane"
     a: float
     b: float
     c_m: float
@@ -72,6 +73,8 @@ class AngleMeasurement(Measurement):
         The planes.
     """
 
+    kind: str = "angle"
+    unit: str = "deg"
     first: PlaneMeasurement
     second: PlaneMeasurement
 
@@ -112,16 +115,9 @@ def measure_plane(chosen: Selection, flatness: bool = True) -> PlaneMeasurement:
     fit = uncertainties(jacobian, distance, sigma, points.xyz_m[:, :2])
     value = _flatness(local, distance, sigma) if flatness else Corrected(np.nan, np.nan)
     return PlaneMeasurement(
-        kind="plane",
         value=value.value,
         uncertainty=value.uncertainty,
-        unit="m",
-        points=len(points),
-        set_aside=len(chosen) - len(points),
-        rms_m=fit.rms_m,
-        dof=fit.dof,
-        inflation=fit.inflation,
-        region=chosen.region,
+        **fit.evidence(len(chosen), chosen.region),
         normal=_three(plane.normal),
         point_m=_three(plane.point_m),
         tilts=tuple(map(tuple, tilts.tolist())),
@@ -156,10 +152,8 @@ def measure_angle(first: Selection, second: Selection) -> AngleMeasurement:
         (one.rms_m**2 * one.points + two.rms_m**2 * two.points) / (one.points + two.points)
     )
     return AngleMeasurement(
-        kind="angle",
         value=180.0 - float(np.degrees(between)),
         uncertainty=float(np.degrees(np.sqrt(variance))),
-        unit="deg",
         points=one.points + two.points,
         set_aside=one.set_aside + two.set_aside,
         rms_m=float(rms),
@@ -178,7 +172,18 @@ def _tilts(normal: Array) -> Array:
     return np.stack([along, np.cross(normal, along)])
 
 
-def _explicit(plane: Plane, tilts: Array, covariance: Array) -> dict[str, float]:
+class Explicit(TypedDict):
+    """Fields of Z = a X + b Y + c, and their standard uncertainties."""
+
+    a: float
+    b: float
+    c_m: float
+    u_a: float
+    u_b: float
+    u_c_m: float
+
+
+def _explicit(plane: Plane, tilts: Array, covariance: Array) -> Explicit:
     """Z = a X + b Y + c with uncertainties, from the covariance of offset and tilts."""
     nx, ny, nz = plane.normal
     x, y, z = plane.point_m
@@ -188,14 +193,8 @@ def _explicit(plane: Plane, tilts: Array, covariance: Array) -> dict[str, float]
         [[t[0] / nz - nx * t[2] / nz**2, t[1] / nz - ny * t[2] / nz**2] for t in tilts]
     ).T
     u_a, u_b = np.sqrt(np.diag(slopes @ covariance[1:, 1:] @ slopes.T))
-    return {
-        "a": float(a),
-        "b": float(b),
-        "c_m": float(z - a * x - b * y),
-        "u_a": float(u_a),
-        "u_b": float(u_b),
-        "u_c_m": float(np.sqrt(covariance[0, 0]) / nz),
-    }
+    c_m, u_c_m = float(z - a * x - b * y), float(np.sqrt(covariance[0, 0]) / nz)
+    return Explicit(a=float(a), b=float(b), c_m=c_m, u_a=float(u_a), u_b=float(u_b), u_c_m=u_c_m)
 
 
 def _flatness(local_m: Array, distance_m: Array, sigma_m: Array) -> Corrected:

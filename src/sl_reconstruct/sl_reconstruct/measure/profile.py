@@ -39,6 +39,7 @@ class ProfileMeasurement(Measurement):
         Distance from the first end, mean height on the line, and its standard uncertainty, metres.
     """
 
+    kind: str = "profile"
     from_m: tuple[float, float]
     to_m: tuple[float, float]
     along_m: Array
@@ -94,10 +95,8 @@ def measure_profile(
     total = peak_to_valley(z, u, np.isfinite(z))
     residual = chosen.xyz_m[:, 2] - np.interp(local[:, 0], s, z)
     return ProfileMeasurement(
-        kind="profile",
         value=total.value,
         uncertainty=total.uncertainty,
-        unit="m",
         points=len(chosen),
         set_aside=0,
         rms_m=float(np.sqrt(np.mean(residual**2))),

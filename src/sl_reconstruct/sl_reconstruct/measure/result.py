@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,11 +88,11 @@ class Measurement:
     Parameters
     ----------
     kind : str
-        What was measured.
+        What was measured; each class has its own.
     value, uncertainty : float
         In `unit`; the uncertainty is a standard one (k = 1).
     unit : {"m", "deg", "1"}
-        Of value and uncertainty.
+        Of value and uncertainty; each class has its own.
     points, set_aside : int
         Points used, and points further off than the stated threshold, which were not.
     rms_m : float
@@ -105,10 +105,10 @@ class Measurement:
         Where the points were taken from; None is everywhere.
     """
 
-    kind: str
+    kind: str = ""
     value: float
     uncertainty: float
-    unit: str
+    unit: str = "m"
     points: int
     set_aside: int
     rms_m: float
@@ -185,6 +185,17 @@ class Tolerance:
         return "undecided"
 
 
+class Evidence(TypedDict):
+    """The fields of a `Measurement` that say what its value rests on."""
+
+    points: int
+    set_aside: int
+    rms_m: float
+    dof: int
+    inflation: float
+    region: Region | None
+
+
 @dataclass(frozen=True)
 class Fitted:
     """Covariance of fitted parameters, and what it was made from.
@@ -208,6 +219,31 @@ class Fitted:
     dof: int
     inflation: float
     variance_m2: Array
+
+    @property
+    def u(self) -> Array:
+        """Standard uncertainties of the parameters, (p,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def evidence(self, offered: int, region: Region | None) -> Evidence:
+        """What a measurement by this fit rests on.
+
+        Parameters
+        ----------
+        offered : int
+            Points there were; those that the fit did not use were set aside.
+        region : Region or None
+            Where they were taken from.
+        """
+        used = len(self.variance_m2)
+        return Evidence(
+            points=used,
+            set_aside=offered - used,
+            rms_m=self.rms_m,
+            dof=self.dof,
+            inflation=self.inflation,
+            region=region,
+        )
 
 
 def uncertainties(jacobian: Array, residual_m: Array, sigma_m: Array, xy_m: Array) -> Fitted:
@@ -257,7 +293,7 @@ def inflation(residual_m: Array, variance_m2: Array, xy_m: Array, parameters: in
     xy_m : ndarray, (n, 2)
         Where the points lie.
     parameters : int
-        Of the fit; they take so many degrees of freedom from the blocks.
+        Of the fit; each takes a degree of freedom from the blocks.
     """
     block = block_numbers(xy_m)
     sums = np.bincount(block, residual_m)

@@ -49,6 +49,7 @@ class RoughnessMeasurement(Measurement):
         Distance of the map's nodes, metres.
     """
 
+    kind: str = "roughness"
     raw: dict[str, float]
     corrected: dict[str, float]
     uncertainties: dict[str, float]
@@ -97,10 +98,8 @@ def measure_roughness(
     spread = {name: one.uncertainty for name, one in found.items()}
     count = int(np.count_nonzero(np.isfinite(height.z_m)))
     return RoughnessMeasurement(
-        kind="roughness",
         value=corrected["Sq"],
         uncertainty=spread["Sq"],
-        unit="m",
         points=int(np.count_nonzero(np.isfinite(cut["z"]))),
         set_aside=0,
         rms_m=raw["Sq"],

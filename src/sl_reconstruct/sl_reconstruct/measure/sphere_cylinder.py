@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sl_common.errors import StackError
-from sl_reconstruct.cloud.plane_fit import TRIM_SD, robust_sd
+from sl_reconstruct.cloud.trimmed_fit import trim
 from sl_reconstruct.measure.region import Selection
 from sl_reconstruct.measure.result import Fitted, Measurement, Quantity, uncertainties
 
@@ -33,6 +33,7 @@ class SphereMeasurement(Measurement):
         Centre and standard uncertainties of its coordinates.
     """
 
+    kind: str = "sphere"
     centre_m: tuple[float, ...]
     u_centre_m: tuple[float, ...]
 
@@ -55,6 +56,7 @@ class CylinderMeasurement(Measurement):
         Unit vector along the axis, x > 0 (y > 0 where x is 0).
     """
 
+    kind: str = "cylinder"
     point_m: tuple[float, ...]
     direction: tuple[float, ...]
 
@@ -74,14 +76,12 @@ def measure_sphere(chosen: Selection) -> SphereMeasurement:
     StackError
         When the points make no sphere.
     """
-    start = _algebraic_sphere(chosen.xyz_m)
-    values, used, residual, jacobian, normal_z = fit_rounds(_sphere, chosen, start)
-    points = chosen.at(used)
-    fit = uncertainties(jacobian, residual, points.sigma_m * np.abs(normal_z), points.xyz_m[:, :2])
-    u = np.sqrt(np.diag(fit.covariance))
+    found = fit_rounds(_sphere, chosen, _algebraic_sphere(chosen.xyz_m))
+    values, u = found.values, found.fit.u
     return SphereMeasurement(
-        kind="sphere",
-        **_of_radius(values[3], u[3], fit, chosen, points),
+        value=float(values[3]),
+        uncertainty=float(u[3]),
+        **found.fit.evidence(len(chosen), chosen.region),
         centre_m=tuple(values[:3].tolist()),
         u_centre_m=tuple(u[:3].tolist()),
     )
@@ -101,73 +101,59 @@ def measure_cylinder(chosen: Selection) -> CylinderMeasurement:
         When the points make no cylinder.
     """
     centre = chosen.xyz_m.mean(axis=0)
-    local = Selection(chosen.xyz_m - centre, chosen.sigma_m)
-    frame, start = _paraboloid_cylinder(local.xyz_m)
-    turned = Selection(local.xyz_m @ frame.T, local.sigma_m)
-    # In the turned frame the axis runs along x; the noise, along z of the world, does not.
-    values, used, residual, jacobian, _ = fit_rounds(_cylinder, turned, start)
-    up = _cylinder_normals(values, turned.xyz_m[used]) @ frame[:, 2]
-    points = chosen.at(used)
-    fit = uncertainties(jacobian, residual, points.sigma_m * np.abs(up), points.xyz_m[:, :2])
+    local = chosen.xyz_m - centre
+    frame, start = _paraboloid_cylinder(local)
+    # In the turned frame the axis runs along x; z is that of the world, along which the noise is.
+    found = fit_rounds(_cylinder, chosen, start, local @ frame.T)
+    values, fit = found.values, found.fit
     direction = np.array([1.0, values[2], values[3]]) / np.hypot(1.0, np.hypot(*values[2:4]))
     point = np.array([0.0, values[0], values[1]])
     point -= (point @ direction) * direction
     direction, point = direction @ frame, point @ frame + centre
     direction = direction if tuple(direction[:2]) > (0.0, 0.0) else -direction
     return CylinderMeasurement(
-        kind="cylinder",
-        **_of_radius(values[4], np.sqrt(fit.covariance[4, 4]), fit, chosen, points),
+        value=float(values[4]),
+        uncertainty=float(fit.u[4]),
+        **fit.evidence(len(chosen), chosen.region),
         point_m=tuple(point.tolist()),
         direction=tuple(direction.tolist()),
     )
 
 
-def _of_radius(
-    radius_m: float, u_m: float, fit: Fitted, chosen: Selection, used: Selection
-) -> dict[str, Any]:
-    """Fields that spheres and cylinders have alike."""
-    return {
-        "value": float(radius_m),
-        "uncertainty": float(u_m),
-        "unit": "m",
-        "points": len(used),
-        "set_aside": len(chosen) - len(used),
-        "rms_m": fit.rms_m,
-        "dof": fit.dof,
-        "inflation": fit.inflation,
-        "region": chosen.region,
-    }
+class Round(NamedTuple):
+    """A fitted sphere, cylinder or circle: parameters, the last a radius, and their evidence."""
+
+    values: Array
+    fit: Fitted
 
 
 def fit_rounds(
-    model: Model, chosen: Selection, start: Array
-) -> tuple[Array, NDArray[np.bool_], Array, Array, Array]:
+    model: Model, chosen: Selection, start: Array, local_m: Array | None = None
+) -> Round:
     """Least squares in rounds that set outliers aside.
 
     Parameters
     ----------
     model : callable
-        Parameters and points to residuals, derivatives and normals; the last one is a radius.
+        Parameters and points to residuals, derivatives and the normals' z.
     chosen : Selection
-        The points.
+        The points; those off by more than 5 robust standard deviations are set aside.
     start : ndarray, (p,)
-        Where to begin.
-
-    Returns
-    -------
-    tuple
-        Parameters, which points were used, and what the model says of these.
+        Where to begin; the last parameter is a radius.
+    local_m : ndarray, (n, 3), optional
+        The points in a frame of the model, with the world's z; their own where left out.
     """
-    used = np.ones(len(chosen), dtype=np.bool_)
-    values = start
-    for _ in range(ROUNDS):
-        values = _gauss_newton(model, chosen.xyz_m[used], values)
-        residual = model(values, chosen.xyz_m)[0]
-        inside = np.abs(residual) <= max(TRIM_SD * robust_sd(residual[used]), 1e-15)
-        if (inside == used).all() or np.count_nonzero(inside) <= len(values):
-            break
-        used = inside
-    return values, used, *model(values, chosen.xyz_m[used])
+    xyz_m = chosen.xyz_m if local_m is None else local_m
+    values, used = trim(
+        lambda used, last: _gauss_newton(model, xyz_m[used], last),
+        lambda values: model(values, xyz_m)[0],
+        start,
+        ROUNDS,
+    )
+    residual, jacobian, normal_z = model(values, xyz_m[used])
+    points = chosen.at(used)
+    sigma_m = points.sigma_m * np.abs(normal_z)
+    return Round(values, uncertainties(jacobian, residual, sigma_m, points.xyz_m[:, :2]))
 
 
 def _gauss_newton(model: Model, xyz_m: Array, values: Array) -> Array:

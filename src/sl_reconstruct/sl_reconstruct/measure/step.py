@@ -36,6 +36,7 @@ class StepMeasurement(Measurement):
         Of the surroundings.
     """
 
+    kind: str = "step"
     walls_m: tuple[float, float]
     axis: Axis
     slope_x: float
@@ -89,16 +90,9 @@ def measure_step(
     residual = points.xyz_m[:, 2] - jacobian @ found
     fit = uncertainties(jacobian, residual, points.sigma_m, points.xyz_m[:, :2])
     return StepMeasurement(
-        kind="step",
         value=float(found[3]),
-        uncertainty=float(np.sqrt(fit.covariance[3, 3])),
-        unit="m",
-        points=len(points),
-        set_aside=int(np.count_nonzero(~used)),
-        rms_m=fit.rms_m,
-        dof=fit.dof,
-        inflation=fit.inflation,
-        region=chosen.region,
+        uncertainty=float(fit.u[3]),
+        **fit.evidence(len(used), chosen.region),
         walls_m=(float(left), float(right)),
         axis=axis,
         slope_x=float(found[0]),

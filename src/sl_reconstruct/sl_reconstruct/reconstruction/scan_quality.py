@@ -150,7 +150,8 @@ def check_phase(u_px: NDArray[np.float32], owner: NDArray[np.int64], images: lis
         Naming the image: it was exchanged for another of the same stripes, or shown twice.
     """
     span = u_px[:, 2:] - u_px[:, :-2]
-    off = (u_px[:, 1:-1] - (u_px[:, 2:] + u_px[:, :-2]) / 2) / np.where(span == 0, np.nan, span) * 2
+    span = np.where(span == 0, np.float32(np.nan), span)
+    off = (u_px[:, 1:-1] - (u_px[:, 2:] + u_px[:, :-2]) / 2) / span * 2
     for i, image in enumerate(images):
         mine = off[:, owner[1:-1] == i]
         middle = median(mine) if np.count_nonzero(np.isfinite(mine)) >= 32 else 0.0
