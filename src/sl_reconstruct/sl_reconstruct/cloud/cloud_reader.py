@@ -25,7 +25,7 @@ def read_cloud(path: str | Path) -> NDArray[Any]:
     ----------
     path : path
         ``.pcd`` (binary, 0.7), ``.ply``, ``.npy`` (structured), or ``.tif``/``.tiff`` with the
-        ``report.json`` beside it that tells its grid.
+        ``report.json`` beside it, which has its grid.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def read_cloud(path: str | Path) -> NDArray[Any]:
 
 
 def read_height_map(path: str | Path) -> HeightMap:
-    """Read a height map (32-bit TIFF) with the grid that the ``report.json`` beside it tells.
+    """Read a height map (32-bit TIFF) with the grid in the ``report.json`` beside it.
 
     Raises
     ------

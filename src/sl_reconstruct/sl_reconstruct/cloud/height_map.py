@@ -14,12 +14,12 @@ from sl_common.documents import written_atomically
 from sl_common.errors import SlError, StackError
 from sl_common.kernel_cache import kernel
 
-#: Neighbours further apart than so many typical spacings lie on different sides of a step or gap.
+#: Neighbours further apart than this many typical spacings lie on different sides of a step or gap.
 MAX_STRETCH = 4.0
 MAX_NODES = 16_000_000
 #: A node counts as under a triangle so far beyond its edge, in parts of the triangle.
 EDGE = 1e-9
-#: Spacings are measured on about so many neighbours.
+#: Spacings are measured on about this many neighbours.
 SAMPLES = 200_000
 
 
@@ -130,7 +130,7 @@ def _rasterise(
 ) -> None:
     """Fill the nodes under all triangles; the grid is x0, y0, greatest length, step in metres.
 
-    Two rows at a time, in units of nodes: the cloud itself may lie in memory as it will.
+    Two rows at a time are copied, in units of nodes, whatever the cloud's order in memory.
     """
     rows, columns = z.shape
     x0_m, y0_m, limit_m, step_m = grid

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Points further off than so many robust standard deviations are set aside.
+#: Points further off than this many robust standard deviations are set aside.
 TRIM_SD = 5.0
 ROUNDS = 4
 #: Median of |N(0, 1)|: turns a median of residuals into a standard deviation.

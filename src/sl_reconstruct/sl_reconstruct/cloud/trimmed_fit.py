@@ -63,10 +63,8 @@ def trim(
 
     Returns
     -------
-    found : ndarray, (p,)
-        Parameters.
-    used : ndarray of bool, (n,)
-        Points that count.
+    found, used
+        As of `trimmed_fit`.
     """
     found, used = start, np.ones(len(residual(start)), dtype=np.bool_)
     for _ in range(rounds):

@@ -22,7 +22,7 @@ from sl_reconstruct.decode.types import Bytes, Floats, Noise, Pixels
 
 #: Sub-pixel phases at which the noise gain of the estimator is tabulated.
 PHASES = 16
-#: Where a pattern's edges are far apart, the code beside an edge may be off by so many DMD px.
+#: Where a pattern's edges are far apart, the code beside an edge may be off by this many DMD px.
 MISREAD_PX = 6.0
 #: A narrow shadow under an edge leaves less than this part of the light beside it.
 DIP = 0.6

@@ -32,7 +32,7 @@ MIN_PIXELS = 64
 ALLOWED_ERRORS = 4.0
 #: Images with others of the same stripes have the limit; images of one kind of stripes this many
 #: times that (glare and interreflection differ by what is lit); white and black, which move no
-#: edge, so many times (projectors droop at full load).
+#: edge, four times (projectors droop at full load).
 OTHERS, FULL = 2.0, 4.0
 
 Group = tuple[Kind, Axis, int, bool]
@@ -190,7 +190,7 @@ def _level(reference: Reference, image: int, roles: Roles) -> Level:
     """Light of an image over the reference's, at the pixels it lights.
 
     Pattern and inverse together are bright and dark together, blurred or not; so the brighter of
-    the two is compared with what the other leaves. Black is told by what it adds to the dark.
+    the two is compared with what the other leaves. For black it is what black adds to the dark.
     """
     values, bright, dark = reference.images[image], reference.bright, reference.dark
     other = roles.partner[image]

@@ -27,16 +27,16 @@ Estimate = Callable[[Array], tuple[Array, float]]
 #: A mean over a window counts as the surface where it agrees with all smaller windows': within so
 #: many standard deviations more than the largest of all points' noise.
 AGREES_SD = 0.5
-#: A band of coefficients holds surface when its power exceeds the noise's by so many deviations.
+#: A band of coefficients holds surface when its power exceeds the noise's by this many deviations.
 BAND_SD = 3.0
 #: Draws of noise for a bias (each with both signs), to know its spectrum, and to repeat the
-#: estimate: a standard deviation of so many is known to 6.5 %.
+#: estimate: a standard deviation of 120 draws is known to 6.5 %.
 DRAWS, FEW, REPEATS = 100, 16, 120
 #: Powers of the noise's variance with which a bias may grow: near ties to a single peak.
 GROWTHS = np.linspace(0.5, 1.0, 51)
 #: Heights with noise at once: bounds memory.
 AT_ONCE = 2_000_000
-#: What a standard deviation has beyond so many times the median one is no noise.
+#: The part of a standard deviation beyond this many times the median one is no noise.
 OUTLYING = 3.0
 #: A place without noise counts as one with so little of the mean variance.
 LEAST_VARIANCE = 1e-6
@@ -152,8 +152,8 @@ def extremes(
     Noise that is left in the estimate hides a part of the bias, as far as it differs between the
     places that may be the extreme. A bias that grows with a power p of the noise's variance is
     hidden but for (1 + left)^p - left^p of it: nothing is hidden where one peak is rounded off
-    (p = 1), more where many heights nearly tie (p = 1/2). Half the noise tells which. The
-    uncertainty is the scatter of the whole estimate, repeated on the estimated surface (double
+    (p = 1), more where many heights nearly tie (p = 1/2). The bias of half the noise shows which.
+    The uncertainty is the scatter of the whole estimate, repeated on the estimated surface (double
     bootstrap).
     """
     alone = noise[:, there]

@@ -19,7 +19,7 @@ from sl_reconstruct.measure.roughness import measure_roughness
 from sl_reconstruct.measure.sphere_cylinder import measure_cylinder, measure_sphere
 from sl_reconstruct.measure.step import measure_step
 
-#: Width of the strip that a section averages where none is told, as a part of its length.
+#: Width of the strip that a section averages where none is given, as a part of its length.
 SECTION_WIDTH = 0.01
 RECTANGLE = "X0,Y0,X1,Y1"
 

@@ -12,7 +12,7 @@ from sl_common.errors import StackError
 from sl_reconstruct.measure.plane_angle import AngleMeasurement, measure_angle
 from sl_reconstruct.measure.region import select
 
-#: The slope at a point is taken from points so many column boundaries on either side.
+#: The slope at a point is taken from points this many column boundaries away on either side.
 REACH = 16
 #: A flank holds at least this part of the points; slopes beyond are taken as its own.
 LEAST_PART = 0.05

@@ -20,14 +20,14 @@ from sl_reconstruct.measure.sphere_cylinder import Round, fit_rounds
 Array = NDArray[np.float64]
 Method = Literal["intensity", "presence"]
 
-#: A hole's own light over the plate's: points that would tell it are refused as too dark.
+#: A hole's own light over the plate's: points that would show it are refused as too dark.
 HOLE_LIGHT = (0.0, 0.04)
 #: The edge lies half-way between the plate's light and the hole's.
 EDGE_LEVEL = 0.5 + 0.25 * sum(HOLE_LIGHT)
 U_EDGE_LEVEL = 0.5 * (HOLE_LIGHT[1] - HOLE_LIGHT[0]) / 12**0.5
 #: Edges between two points that are needed to go by the light.
 LEAST_EDGES = 8
-#: Points are refused up to so many spacings beside an edge, as its blur mixes hole and plate.
+#: Points are refused up to this many spacings beside an edge, as its blur mixes hole and plate.
 REFUSED_SPACINGS = 3.0
 
 

@@ -17,7 +17,7 @@ from sl_reconstruct.measure.result import Measurement, Quantity, uncertainties
 
 Array = NDArray[np.float64]
 
-#: Flatness is taken from means over so many cells along a side: a point alone is mostly noise.
+#: Flatness is taken from means over this many cells along a side: a single point is mostly noise.
 FLATNESS_CELLS = 40
 #: A cell speaks when it holds this part of what a cell holds usually.
 FULL_CELL = 0.5

@@ -19,9 +19,9 @@ Array = NDArray[np.float64]
 
 #: Points along the section where no step is given: as many bins.
 BINS = 500
-#: A bin's scatter is measured where it holds so many points; below, only stated sigmas count.
+#: A bin's scatter is measured where it holds this many points; below, only stated sigmas count.
 SCATTER_POINTS = 5
-#: The surface's tilt is taken from so many points.
+#: The surface's tilt is taken from this many points.
 TILT_POINTS = 30
 #: Points are as good as in line when so little of their spread is left across it.
 IN_LINE = 0.1
@@ -117,8 +117,8 @@ def _means(
     """Mean place along the line, height on the line and its uncertainty, of bins with points.
 
     The surface's tilt is no scatter, and would shift the mean where points lie more on one side of
-    the line. Along the line each bin has its own, across it so many bins as hold enough points
-    have one together.
+    the line. Along the line each bin has its own, across it neighbouring bins that
+    hold enough points together share one.
     """
     count = np.bincount(number, minlength=bins)
     share = 1.0 / np.maximum(count, 1)

@@ -71,7 +71,7 @@ class Answer:
     judged : Quantity
         The one that the tolerance is for.
     verdict : {"pass", "fail", "undecided", ""}
-        On it; empty where no tolerance was told.
+        On it; empty where no tolerance was given.
     """
 
     found: Measurement
@@ -107,7 +107,7 @@ def measure_cloud(order: MeasurementRequest, points: Points) -> Answer:
     StackError
         When this cloud does not hold the feature.
     """
-    # A wrong tolerance is told before the measurement takes its time.
+    # A wrong tolerance is refused before the measurement takes its time.
     limits = Tolerance(*order.tolerance) if order.tolerance else None
     found = _measure(order, points)
     judged = found.quantity(order.quantity)

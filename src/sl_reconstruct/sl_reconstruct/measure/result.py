@@ -26,13 +26,13 @@ from sl_reconstruct.measure.region import Region
 Array = NDArray[np.float64]
 Verdict = Literal["pass", "fail", "undecided"]
 
-#: Blocks along a side of the region at most, and points that a block shall have at least.
+#: Blocks along a side of the region at most, and the least number of points in a block.
 BLOCKS, BLOCK_POINTS = 10, 25
 #: Part of a point's standard deviation that no averaging takes away: errors of the edges that are
 #: the same over the field. From the bench with its true calibration (docs/measure.md): groove
 #: angles of 460,000 points are off by 0.00004 degrees, where noise alone explains 0.00003.
 COMMON = 0.002
-#: Means of blocks count as correlated when they scatter by so many standard errors too much.
+#: Means of blocks count as correlated when they scatter by this many standard errors too much.
 SIGNIFICANT = 2.0
 #: One-sided 95 %: the guard band of ISO 14253-1:2017 in standard uncertainties.
 GUARD = 1.6449

@@ -26,9 +26,9 @@ NUMBERS = ("Ssk", "Sku", "Sdr", "Sdq")
 #: Parameters to which noise adds as variances do.
 SQUARES = ("Sa", "Sq", "Sdq")
 EXTREMES = ("Sp", "Sv", "Sz")
-#: Repetitions of the points' noise that tell bias and uncertainty; of extremes, as many as fit.
+#: Repetitions of the points' noise for bias and uncertainty; of extremes, as many as fit.
 DRAWS, MANY, HEIGHTS = 48, 120, 50_000_000
-#: Ssk and Sku are powers of 1 / Sq: told where Sq is at least so many uncertainties.
+#: Ssk and Sku are powers of 1 / Sq: given where Sq is at least this many uncertainties.
 KNOWN = 3.0
 MICROMETRE_M = 1e-6
 
@@ -215,11 +215,11 @@ def _corrected(
     inner = _levelled(fill(_without_border(np.asarray(height.z_m, dtype=np.float64))))
     estimate = Waves(noise)
     clean = estimate(inner)[0]
-    told = areal_parameters(clean, height.step_m)
+    smooth = areal_parameters(clean, height.step_m)
     drawn = [areal_parameters(clean + draw, height.step_m) for draw in noise[:DRAWS]]
     found = {
         name: take_off(
-            raw[name], told[name], np.array([one[name] for one in drawn]), name in SQUARES
+            raw[name], smooth[name], np.array([one[name] for one in drawn]), name in SQUARES
         )
         for name in raw
     }

@@ -18,7 +18,7 @@ from sl_reconstruct.measure.result import Measurement, uncertainties
 Array = NDArray[np.float64]
 Axis = Literal["x", "y"]
 
-#: Walls are looked for among medians of so many slices across the step.
+#: Walls are looked for among medians of this many slices across the step.
 SLICES = 300
 
 

@@ -192,12 +192,8 @@ def a_device(value: Any, where: str, error: type[SlError]) -> Device:
 
     Parameters
     ----------
-    value : object
-        What the document has.
-    where : str
-        Its place, for messages.
-    error : type
-        What is raised.
+    value, where, error
+        As in `a_string`.
     """
     fields = Fields(value, where, error, _DEVICE_KEYS)
     model = fields.get("model", a_string)
@@ -212,7 +208,7 @@ def a_device(value: Any, where: str, error: type[SlError]) -> Device:
             focal_length_px=fields.get("focal_length_px", _focal_length),
             image_centre_px=_pair(fields.get("image_centre_px", numbers(2))),
             pixel_pitch_m=fields.get("pixel_pitch_m", a_number),
-            rotation=fields.get("rotation", a_rotation),
+            rotation=fields.get("rotation", _rotation),
             translation_m=np.array(fields.get("translation_m", numbers(3))),
             lens=_lens(fields, model),
         )
@@ -239,18 +235,8 @@ def _focal_length(value: Any, where: str, error: type[SlError]) -> tuple[float, 
     return length, length
 
 
-def a_rotation(value: Any, where: str, error: type[SlError]) -> Array:
-    """Check that a value is a 3 x 3 rotation, row by row; see `nearest_rotation`.
-
-    Parameters
-    ----------
-    value : object
-        What the document has.
-    where : str
-        Its place, for messages.
-    error : type
-        What is raised.
-    """
+def _rotation(value: Any, where: str, error: type[SlError]) -> Array:
+    """Check that a value is a 3 x 3 rotation, row by row; see `nearest_rotation`."""
     rows = a_list(value, where, error)
     if len(rows) != 3:
         raise error(f"{where} has {len(rows)} rows; expected 3")
@@ -263,12 +249,8 @@ def a_covariance(value: Any, where: str, error: type[SlError]) -> Covariance:
 
     Parameters
     ----------
-    value : object
-        What the document has.
-    where : str
-        Its place, for messages.
-    error : type
-        What is raised.
+    value, where, error
+        As in `a_string`.
     """
     fields = Fields(value, where, error, ("parameters", "matrix"))
     names = [a_string(name, where, error) for name in fields.get("parameters", a_list)]

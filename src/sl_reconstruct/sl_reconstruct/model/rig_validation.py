@@ -1,4 +1,4 @@
-"""Whether a rig's numbers can belong to a real rig: catches metres for millimetres, and kin.
+"""Whether a rig's numbers can belong to a real rig: catches metres for millimetres.
 
 The limits are wide - from a microscope to a room - and a factor of a thousand does not fit
 through any of them.

@@ -21,7 +21,7 @@ MAX_GEOMETRY = 0.05
 MAX_CONFUSED = 0.4
 #: Boundaries of a row that lie in order, median over rows: fewer means exchanged images.
 MIN_ORDER = 0.8
-#: An image's edges may lie off the middle of their neighbours by so many DMD pixels, median.
+#: An image's edges may lie off the middle of their neighbours by this many DMD pixels, median.
 MAX_PHASE = 0.35
 
 Array = NDArray[np.float64]
